@@ -1,4 +1,4 @@
-"""Times of the linear solvers, compared with the predictions of the cost model (`solver/cost_model.py`).
+"""Times of the linear solvers, compared with the predictions of the cost model (`solver/choose.py`).
 
     python -m benchmarks.choice [PROBLEM ...] [--solver ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
 
@@ -24,8 +24,7 @@ from benchmarks.suite import LARGE_SCENES, real_problems
 from jaxba.bench.sources import sources
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
-from jaxba.solver.choose import choose
-from jaxba.solver.cost_model import SECONDS, Work, work
+from jaxba.solver.choose import SECONDS, Work, choose, seconds, work
 from jaxba.solver.names import parse_solver
 
 
@@ -39,10 +38,10 @@ class Timed(NamedTuple):
 def measure(problem: BundleProblem, solver: str, iterations: int, repeats: int) -> dict[str, Timed]:
     """Median time of an iteration with each linear solver that fits into memory, timed alternately. The first round
     compiles and is not counted."""
-    seconds: dict[str, list[float]] = {name: [] for name in work(problem)}
+    spent: dict[str, list[float]] = {name: [] for name in work(problem)}
     products = {}
     for repeat in range(repeats + 1):
-        for name, times in seconds.items():
+        for name, times in spent.items():
             policy, options = parse_solver(solver).build()
             end = jaxba.solve(
                 problem,
@@ -52,16 +51,16 @@ def measure(problem: BundleProblem, solver: str, iterations: int, repeats: int) 
             products[name] = float(np.sum(end.history.cg_iterations)) / end.iterations
             if repeat:
                 times.append(end.total_s / end.iterations)
-    return {name: Timed(statistics.median(times), products[name]) for name, times in seconds.items()}
+    return {name: Timed(statistics.median(times), products[name]) for name, times in spent.items()}
 
 
 def fit(done: list[tuple[Work, float]]) -> Work:
     """The non-negative constants with the least sum of squared relative errors."""
-    seconds = np.array([each for _, each in done])
-    unit = np.array(SECONDS)
-    amounts = np.array([amounts for amounts, _ in done]) * unit / seconds[:, None]
+    taken = np.array([each for _, each in done])
+    unit = np.array(list(SECONDS.values()))
+    amounts = np.array([[amounts.get(kind, 0.0) for kind in SECONDS] for amounts, _ in done]) * unit / taken[:, None]
     found, _ = nnls(amounts, np.ones(len(done)))
-    return Work(*(found * unit).tolist())
+    return dict(zip(SECONDS, (found * unit).tolist(), strict=True))
 
 
 def main() -> None:
@@ -87,12 +86,12 @@ def main() -> None:
             amounts = work(problem, time.products)[name]
             done.append((amounts, time.seconds))
             mark = "*" if name == taken else ""
-            cells.append(f"{mark}{name} {1e3 * time.seconds:.2f} ({1e3 * amounts.seconds:.2f}, {time.products:.1f})")
+            cells.append(f"{mark}{name} {1e3 * time.seconds:.2f} ({1e3 * seconds(amounts):.2f}, {time.products:.1f})")
         print(f"{source.name}: {'; '.join(cells)}: {losses[-1]:.2f}", flush=True)
     print(f"loss: geometric mean {np.exp(np.mean(np.log(losses))):.3f}, largest {max(losses):.2f}")
     if args.fit:
-        for name, each in fit(done)._asdict().items():
-            print(f"{name}: {each:.2e} (stated: {getattr(SECONDS, name):.2e})")
+        for name, each in fit(done).items():
+            print(f"{name}: {each:.2e} (stated: {SECONDS[name]:.2e})")
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import parse_solver
 from jaxba.solver.stepwise import try_candidate
-from jaxba.structure.layout import layout_for
+from jaxba.structure.layout import build_layout
 
 LONGEST = 10.0
 """Limit in seconds of all repeats of one program."""
@@ -83,7 +83,7 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
     options = choose_linear_solver(problem, solve_options.step_options(policy), choice)
     with jax.enable_x64(name.dtype == "float64"):
         dtype = jnp.dtype(name.dtype)
-        layout = jax.device_put(layout_for(problem, options))
+        layout = jax.device_put(build_layout(problem, options))
         state = jax.jit(step.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
         propose = lambda la, s, d: step.propose(la, s, d, options)

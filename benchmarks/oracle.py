@@ -43,7 +43,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.names import parse_solver
-from jaxba.structure.layout import layout_for
+from jaxba.structure.layout import build_layout
 
 GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
 """Lambdas tried from every state."""
@@ -114,7 +114,7 @@ def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterat
         width: number of states that are kept; 1 is greedy search.
     """
     options = choose_linear_solver(problem, options, "auto")
-    layout = jax.device_put(layout_for(problem, options))
+    layout = jax.device_put(build_layout(problem, options))
     start = jax.jit(initial_state, static_argnums=(2, 3))(layout, problem, options, jnp.dtype("float64"))
     number = lambda x: jnp.asarray(x, start.cost.dtype)
     take: Callable[[LMState, float, int], LMState] = lambda state, damping, turn: _step(

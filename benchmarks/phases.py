@@ -21,25 +21,23 @@ import numpy as np
 from jaxba.bench.sources import sources
 from jaxba.linear import formed, reduced_system, schur
 from jaxba.linear.band_cholesky import band_factor
-from jaxba.linear.blocks import dense_blocks
 from jaxba.linear.cholesky import factor_and_solve
-from jaxba.linear.two_level import Anchor, coarse_preconditioner
+from jaxba.linear.two_level import coarse_preconditioner
 from jaxba.lm import step
 from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.points import refine_points
-from jaxba.rotations import rotation_matrix
 from jaxba.runtime import process
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 
 
 def _factor(layout: Layout, blocks: jax.Array, right: jax.Array) -> jax.Array:
     """Solves a system that is formed in blocks, as a band or dense."""
-    pairs = formed.pairs_of(layout)
+    pairs = layout.part("pairs")
     if pairs.band is None:
-        return factor_and_solve(dense_blocks(pairs, blocks), right.reshape(-1))
+        return factor_and_solve(formed.dense_blocks(pairs, blocks), right.reshape(-1))
     return band_factor(pairs.band, blocks).solve(right)
 
 
@@ -109,35 +107,34 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     damping = jnp.asarray(1e-4)
     yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
+    system_of = lambda la, li, s: schur.DampedSystem.of(la, li, s.cameras, s.points, damping, plain)[2:4]
     yield phase("eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping)
-    points = done["eliminate"]
-    rotation = schur.RotationCoordinates.of(state.cameras, plain)
-    by_camera = lambda la, li, po, tu: schur.camera_system(la, li, po, tu, damping, plain)
-    yield phase("camera sums", by_camera, linear, points, rotation)
-    system = done["camera sums"]
+    yield phase("eliminate, sum", system_of, linear, state)
+    points, system = done["eliminate, sum"]
+
+    def whole(la: Layout, li: Any, po: Any, sy: Any, s: Any) -> schur.DampedSystem:
+        rotation = schur.rotation_coordinates(s.cameras, plain)
+        at = s.cameras, s.points
+        return schur.DampedSystem(la, li, po, sy, damping, at, rotation, plain.conjugate_gradients.forcing)
+
+    parts = linear, points, system, state
     if layout.grid is not None:
-        yield phase("form", lambda la, li, po, sy: formed.dense_system(la, li, po, sy), linear, points, system)
+        yield phase("form", lambda *parts: formed.dense_system(whole(*parts)), *parts)
         factor = lambda _, m, x: factor_and_solve(m, x.reshape(-1))
         yield phase("factor", factor, done["form"], system.right)
     elif plain.forms_reduced_system:
-        yield phase("form", lambda la, li, po, sy: formed.reduced_blocks(la, li, po, sy), linear, points, system)
+        yield phase("form", lambda *parts: formed.reduced_blocks(whole(*parts)), *parts)
         direct = plain.linear_solver == "explicit"
         solve = _factor if direct else formed.apply_blocks
         name = "factor" if direct else "one product"
         yield phase(name, lambda la, b, x: solve(la, b, x), done["form"], system.right)
     else:
-        product = lambda la, li, po, sy, x: schur.apply_reduced(la, li, po, sy, x)
-        yield phase("one product", product, linear, points, system, system.right)
-    anchor = Anchor(rotation_matrix(state.cameras[:3]), state.cameras[3:6], state.points)
+        yield phase("one product", lambda *parts: schur.apply_reduced(whole(*parts), parts[3].right), *parts)
     if plain.uses_camera_clusters:
-        coarse = lambda la, li, po, sy, an, x: coarse_preconditioner(la, li, po, sy, an)(x)
-        yield phase("coarse system", coarse, linear, points, system, anchor, system.right)
-    whole = lambda la, li, po, sy, an: reduced_system.solve_reduced(
-        la, li, po, sy, an, plain, plain.conjugate_gradients.forcing
-    )
-    yield phase("reduced solve", whole, linear, points, system, anchor)
-    back = lambda la, li, po, x: schur.back_substitute(la, li, po, x)
-    yield phase("back-substitute", back, linear, points, system.right)
+        coarse = lambda *parts: coarse_preconditioner(whole(*parts))(parts[3].right)
+        yield phase("coarse system", coarse, *parts)
+    yield phase("reduced solve", lambda *parts: reduced_system.solve_reduced(whole(*parts), plain), *parts)
+    yield phase("back-substitute", lambda *parts: schur.back_substitute(whole(*parts), parts[3].right), *parts)
     yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
     count = options.refinement.points
     if count:
@@ -162,7 +159,7 @@ def main() -> None:
     problem = sources([args.problem])[0].read()
     options = StepOptions(linear_solver=args.solver, refinement=Refinement(points=args.refine))
     started = time.perf_counter()
-    arrays = layout_for(problem, options)
+    arrays = build_layout(problem, options)
     print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
     print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} slots")
     rate = bandwidth()

@@ -171,13 +171,13 @@ def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
     """Median seconds on the host to make the layout for the linear solver that `auto` chooses."""
     from jaxba import StepOptions
     from jaxba.solver.choose import choose_linear_solver
-    from jaxba.structure.layout import layout_for
+    from jaxba.structure.layout import build_layout
 
     options = choose_linear_solver(problem, StepOptions(), "auto")
     times = []
     for _ in range(max(repeats, 3)):
         started = time.perf_counter()
-        layout_for(problem, options)
+        build_layout(problem, options)
         times.append(time.perf_counter() - started)
     return statistics.median(times)
 

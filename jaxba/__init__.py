@@ -45,8 +45,7 @@ from jaxba.results.covariance import Covariance, covariance
 from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
 from jaxba.results.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
-from jaxba.solver.compiled import solve_loop
-from jaxba.solver.iteration import Carry
+from jaxba.solver.iteration import Carry, solve_loop
 from jaxba.solver.loop import IterationRecord
 from jaxba.solver.methods import METHODS, make_method
 from jaxba.solver.options import SolveOptions

@@ -34,7 +34,7 @@ from jaxba import (
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
 from jaxba.problem.frames import in_frames
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -167,7 +167,7 @@ def arrays(problem: BundleProblem) -> tuple:
 def start(problem: BundleProblem, options: StepOptions | None = None, dtype: str = "float64"):
     """Layout and state of a problem."""
     options = options or StepOptions()
-    layout = layout_for(problem, options)
+    layout = build_layout(problem, options)
     return layout, _initial(layout, in_frames(problem), options, dtype)
 
 
@@ -204,7 +204,7 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
         **{name: number(value) for name, value in values.items()},
         accepted=jnp.asarray(accepted),
         weightless=jnp.asarray(False),
-        **dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), jnp.asarray(0, jnp.int32)),
+        **dict.fromkeys(("cg_iterations", "repairs"), jnp.asarray(0, jnp.int32)),
     )
 
 

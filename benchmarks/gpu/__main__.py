@@ -27,7 +27,7 @@ from jaxba.bench.sources import sources
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.choose import choose
 from jaxba.solver.options import SolveOptions
-from jaxba.structure.layout import layout_for
+from jaxba.structure.layout import build_layout
 from jaxba.training.sac import SacConfig
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
@@ -127,7 +127,7 @@ def main() -> int:
         print(f"\n{source.name}: {problem.num_cameras} cameras, {problem.num_observations} observations\n{HEADING}")
         options = StepOptions(linear_solver=choose(problem), refinement=Refinement(points=3))
         started = time.perf_counter()
-        layout = jax.device_put(layout_for(problem, options))
+        layout = jax.device_put(build_layout(problem, options))
         entry: dict[str, Any] = {"solver": options.linear_solver, "layout_s": time.perf_counter() - started}
         entry["phases"] = []
         for phase in measure(layout, problem, options, rate, args.repeats):

@@ -25,10 +25,11 @@ from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory, threads
 from jaxba.solver.loop import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
-from jaxba.solver.names import SolverName, SolverNameError, parse_solver
+from jaxba.solver.names import SolverName, parse_solver
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.record import Record, record_of
 from jaxba.solver.solve import Solution, solve
+from jaxba.typing import InputError
 
 RESULTS = "results.jsonl"
 """File of the records, one line per run."""
@@ -121,7 +122,7 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once.
 
     Raises:
-        SolverNameError, UnknownPolicyError: an unknown solver, one whose type its method does not have, or one whose
+        InputError: an unknown solver, one whose type its method does not have, or one whose
             library is not installed.
     """
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
@@ -138,7 +139,7 @@ def _check_options(solver: SolverName) -> None:
     try:
         options.step_options(policy)
     except ValueError as error:
-        raise SolverNameError(f"{error} (in {str(solver)!r})") from None
+        raise InputError(f"{error} (in {str(solver)!r})") from None
 
 
 def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:

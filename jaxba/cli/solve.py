@@ -237,7 +237,7 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
 
     Raises:
         UsageError: a number out of range, or options that do not go together; the message names the option.
-        UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy` and `make_method`.
+        InputError: as `make_policy` and `make_method`.
     """
     try:
         policy, options = solver_name(args).build()

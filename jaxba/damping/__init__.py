@@ -2,12 +2,10 @@
 
 from jaxba.damping.learned import AgentPolicy, ConstantAction, LearnedPolicy
 from jaxba.damping.policy import DampingPolicy, ProblemInfo
-from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
+from jaxba.damping.policy_file import load_policy, save_policy
 from jaxba.damping.registry import (
     LEARNED,
-    LEARNED_PLAIN,
     POLICIES,
-    UnknownPolicyError,
     brings_embedded,
     is_learned,
     make_policy,
@@ -16,7 +14,6 @@ from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
 
 __all__ = [
     "LEARNED",
-    "LEARNED_PLAIN",
     "POLICIES",
     "AgentPolicy",
     "Ceres",
@@ -25,10 +22,8 @@ __all__ = [
     "DampingPolicy",
     "Geometric",
     "LearnedPolicy",
-    "PolicyFileError",
     "ProblemInfo",
     "Schedule",
-    "UnknownPolicyError",
     "brings_embedded",
     "is_learned",
     "load_policy",

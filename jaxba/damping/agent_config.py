@@ -20,7 +20,7 @@ class AgentConfig:
 
     observation: Observation = "scale-free"
     """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
-    errors. `duration`: minus the duration of each of the last iterations by the game's clock (`damping/clock.py`; the
+    errors. `duration`: minus the duration of each of the last iterations by the game's clock (`features.duration`; the
     paper's reversed roles of state and reward)."""
 
     history: int = 5

@@ -15,7 +15,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
-from jaxba.refinement.backtracking import SHORTER
+from jaxba.refinement.candidates import SHORTER
 from jaxba.typing import register_pytree
 
 INEXACT_FRACTION = 0.1

@@ -25,10 +25,6 @@ LARGEST_FILE = 1 << 20
 """Largest size of a policy file in bytes."""
 
 
-class PolicyFileError(InputError):
-    """A file that is not a usable policy. The message is one line for a person."""
-
-
 def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str] | None = None) -> None:
     """Writes a policy file atomically.
 
@@ -38,7 +34,7 @@ def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str
         metadata: where the policy comes from, for people.
 
     Raises:
-        PolicyFileError: the file would be larger than `LARGEST_FILE`.
+        InputError: the file would be larger than `LARGEST_FILE`.
     """
     from safetensors.numpy import save
 
@@ -49,9 +45,7 @@ def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str
     metadata = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
     content = _with_sorted_metadata(save(tensors, metadata))
     if len(content) > LARGEST_FILE:
-        raise PolicyFileError(
-            f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file"
-        )
+        raise InputError(f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file")
     with atomic_write(path) as file:
         file.write(content)
 
@@ -71,37 +65,37 @@ def load_policy(path: str | Path) -> LearnedPolicy:
     """Reads a policy file.
 
     Raises:
-        PolicyFileError: the file cannot be read, is not a policy, or its weights do not fit its configuration.
+        InputError: the file cannot be read, is not a policy, or its weights do not fit its configuration.
     """
     tensors, metadata = _read(Path(path))
     if metadata.get("format") != FORMAT:
-        raise PolicyFileError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")
+        raise InputError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")
     try:
         agent = json.loads(metadata["agent"])
         if agent.pop("effort", "fixed") != "fixed":  # a setting of earlier versions
             raise ValueError("its actions decide more than lambda")
         config = config_from(agent)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise PolicyFileError(f"{path}: cannot be used by this version: {error}") from None
+        raise InputError(f"{path}: cannot be used by this version: {error}") from None
     count = len(tensors) // 2
     try:
         layers = tuple(Layer(tensors[f"layer{k}.kernel"], tensors[f"layer{k}.bias"]) for k in range(count))
     except KeyError as error:
-        raise PolicyFileError(f"{path}: {error} is missing") from None
+        raise InputError(f"{path}: {error} is missing") from None
     size = observation_size(config)
     for k, layer in enumerate(layers):
         if layer.kernel.ndim != 2 or layer.kernel.shape[0] != size or layer.bias.shape != layer.kernel.shape[1:]:
-            raise PolicyFileError(
+            raise InputError(
                 f"{path}: layer {k} has the shape {layer.kernel.shape}, which does not take {size} numbers "
                 f"(observation {config.observation!r}, history {config.history})"
             )
         if layer.kernel.dtype != np.float32 or layer.bias.dtype != np.float32:
-            raise PolicyFileError(f"{path}: layer {k} is not of type float32")
+            raise InputError(f"{path}: layer {k} is not of type float32")
         if not (np.isfinite(layer.kernel).all() and np.isfinite(layer.bias).all()):
-            raise PolicyFileError(f"{path}: layer {k} holds numbers that are not finite")
+            raise InputError(f"{path}: layer {k} holds numbers that are not finite")
         size = layer.kernel.shape[1]
     if not layers or size != 2:
-        raise PolicyFileError(f"{path}: the last layer must give 2 numbers, not {size}")
+        raise InputError(f"{path}: the last layer must give 2 numbers, not {size}")
     return LearnedPolicy(tuple(layers), config)
 
 
@@ -110,13 +104,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
     try:
         if path.is_dir():
-            raise PolicyFileError(f"{path}: a directory, not a policy file")
+            raise InputError(f"{path}: a directory, not a policy file")
         if path.stat().st_size > LARGEST_FILE:
-            raise PolicyFileError(f"{path}: no policy file, it is larger than {LARGEST_FILE} bytes")
+            raise InputError(f"{path}: no policy file, it is larger than {LARGEST_FILE} bytes")
         with safe_open(path, framework="numpy") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
             return tensors, dict(file.metadata() or {})
     except OSError as error:
-        raise PolicyFileError(f"{path}: {error.strerror or 'no such file'}") from None
+        raise InputError(f"{path}: {error.strerror or 'no such file'}") from None
     except SafetensorError:
-        raise PolicyFileError(f"{path}: not a safetensors file") from None
+        raise InputError(f"{path}: not a safetensors file") from None

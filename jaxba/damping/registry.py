@@ -14,26 +14,25 @@ from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 from jaxba.typing import InputError
 
-LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
-"""The shipped policies: for a step with embedded iterations; for lambda alone (`learned+refine0`); and for lambda alone
-if another library makes the step and damps cameras and points alike. In the name of a solver, `learned` means the one
-that fits the step (solver/names.py)."""
+LEARNED, BOLD = "learned", "bold"
+"""Shipped networks, and the guard and step of the same without a network."""
+
+PLAIN, DRIVER = "-plain", "-driver"
+"""Endings of their variants: for lambda alone (`learned+refine0`), and for lambda alone if another library makes the
+step and damps cameras and points alike. In the name of a solver, `learned` and `bold` mean the one that fits the step
+(solver/names.py)."""
 
 SHIPPED = {
     LEARNED: "default.safetensors",
-    LEARNED_PLAIN: "plain.safetensors",
-    LEARNED_DRIVER: "driver.safetensors",
+    LEARNED + PLAIN: "plain.safetensors",
+    LEARNED + DRIVER: "driver.safetensors",
 }
 """Their files in `jaxba/policies`, each trained with the preset of `jaxba-train` that has the file's name."""
-
-BOLD, BOLD_PLAIN, BOLD_DRIVER = "bold", "bold-plain", "bold-driver"
-"""No network, but the guard and the step of the shipped policies, in the same order. In the name of a solver, `bold`
-means the one that fits the step."""
 
 GUARDED = "guarded"
 """The default policy of a solve."""
 
-_GUARD_OF = {BOLD: LEARNED, BOLD_PLAIN: LEARNED_PLAIN, BOLD_DRIVER: LEARNED_DRIVER}
+_GUARD_OF = {BOLD + name.removeprefix(LEARNED): name for name in SHIPPED}
 
 
 def bold(guard_of: str = LEARNED) -> ConstantAction:
@@ -66,10 +65,6 @@ CONSTANT = "constant"
 """Prefix of `constant:VALUE`."""
 
 
-class UnknownPolicyError(InputError):
-    """A name that is not a policy. The message is one line for a person."""
-
-
 def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
@@ -79,8 +74,7 @@ def make_policy(name: str) -> DampingPolicy:
             `constant:LAMBDA`.
 
     Raises:
-        UnknownPolicyError: no such policy, or a lambda that is not a positive number.
-        PolicyFileError: a path, but not of a policy file.
+        InputError: no such policy, a lambda that is not a positive number, or a path that is not of a policy file.
     """
     if name in SHIPPED:
         return _shipped(name)
@@ -92,17 +86,17 @@ def make_policy(name: str) -> DampingPolicy:
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
     if "+" in base:
-        raise UnknownPolicyError(
+        raise InputError(
             f"unknown damping policy {name!r}: its name has no '+'; the method and embedded iterations are options"
         )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])
-        raise UnknownPolicyError(f"unknown damping policy {name!r}; known: {known}")
+        raise InputError(f"unknown damping policy {name!r}; known: {known}")
     policy = POLICIES[base][0]()
     if not colon:
         return policy
     if not hasattr(policy, "initial"):
-        raise UnknownPolicyError(f"{base!r} has no first lambda to set; use constant:LAMBDA")
+        raise InputError(f"{base!r} has no first lambda to set; use constant:LAMBDA")
     return replace(policy, initial=_damping(name, number))  # type: ignore[type-var]
 
 
@@ -126,5 +120,5 @@ def _damping(name: str, number: str) -> float:
     except ValueError:
         value = math.nan
     if not (value > 0 and math.isfinite(value)):
-        raise UnknownPolicyError(f"{name!r}: lambda must be a positive number, not {number!r}")
+        raise InputError(f"{name!r}: lambda must be a positive number, not {number!r}")
     return value

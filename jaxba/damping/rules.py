@@ -5,8 +5,9 @@ Formulas and sources are in the docstring of each class.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -25,42 +26,6 @@ SMALLEST = 1e-30
 
 def _scalar(value: Any, info: ProblemInfo) -> Array:
     return jnp.asarray(value, info.cost.dtype)
-
-
-@register_pytree
-@dataclass(frozen=True)
-class Classic:
-    """The paper's baseline: halve after a good step, double otherwise.
-
-    Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain threshold
-    0.4 as in the authors' released code, since the printed text swaps them. A step that lowers the cost is
-    always accepted.
-    """
-
-    initial: float = 0.25
-    """First lambda. Source: the paper."""
-
-    good_gain: float = 0.4
-    """Gain ratio above which lambda is halved. Source: released code."""
-
-    min_gain: float = 0.0
-    """Any decrease is accepted."""
-
-    def init(self, info: ProblemInfo) -> tuple[Array, Array]:
-        """See `DampingPolicy`."""
-        damping = _scalar(self.initial, info)
-        return damping, damping
-
-    def propose(self, state: Float[Array, ""], step: StepInfo) -> tuple[Array, Array]:
-        """See `DampingPolicy`."""
-        good = step.accepted & (step.gain_ratio > self.good_gain)
-        damping = jnp.minimum(state * jnp.where(good, 0.5, 2.0), LARGEST).astype(state.dtype)
-        return damping, damping
-
-
-class _Growing(NamedTuple):
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]  # factor after the next rejection
 
 
 @register_pytree
@@ -101,17 +66,16 @@ class Ceres:
         """Factor after a number of rejections in a row, at least one."""
         return self.reject_growth * 2.0 ** (rejections - 1)
 
-    def init(self, info: ProblemInfo) -> tuple[_Growing, Array]:
-        """See `DampingPolicy`."""
+    def init(self, info: ProblemInfo) -> tuple[Array, Array]:
+        """See `DampingPolicy`. The state is the factor after the next rejection."""
         damping = _scalar(self.initial * (1 + self.relative * (info.unit - 1)), info)
-        return _Growing(damping, _scalar(self.reject_growth, info)), damping
+        return _scalar(self.reject_growth, info), damping
 
-    def propose(self, state: _Growing, step: StepInfo) -> tuple[_Growing, Array]:
+    def propose(self, state: Float[Array, ""], step: StepInfo) -> tuple[Array, Array]:
         """See `DampingPolicy`."""
-        factor = self.factor(step.accepted, step.gain_ratio, state.growth)
-        growth = jnp.where(step.accepted, self.reject_growth, 2 * state.growth).astype(state.growth.dtype)
-        damping = jnp.clip(state.damping * factor, self.minimum, LARGEST).astype(state.damping.dtype)
-        return _Growing(damping, growth), damping
+        factor = self.factor(step.accepted, step.gain_ratio, state)
+        growth = jnp.where(step.accepted, self.reject_growth, 2 * state).astype(state.dtype)
+        return growth, jnp.clip(step.damping * factor, self.minimum, LARGEST).astype(state.dtype)
 
 
 def nielsen() -> Ceres:
@@ -126,7 +90,7 @@ def nielsen() -> Ceres:
 @register_pytree
 @dataclass(frozen=True)
 class Geometric:
-    """Multiply by a constant after success, by another after a rejection."""
+    """Multiply by a constant after success, by another otherwise."""
 
     initial: float
     """First lambda."""
@@ -146,16 +110,36 @@ class Geometric:
     min_gain: float = 0.0
     """A step with a smaller gain ratio is rejected."""
 
-    def init(self, info: ProblemInfo) -> tuple[Array, Array]:
-        """See `DampingPolicy`."""
-        damping = _scalar(self.initial, info)
-        return damping, damping
+    good_gain: float = -math.inf
+    """Gain ratio above which an accepted step counts as a success."""
 
-    def propose(self, state: Float[Array, ""], step: StepInfo) -> tuple[Array, Array]:
+    def init(self, info: ProblemInfo) -> tuple[tuple[()], Array]:
         """See `DampingPolicy`."""
-        factor = jnp.where(step.accepted, self.success, self.failure)
-        damping = jnp.clip(state * factor, self.minimum, self.maximum).astype(state.dtype)
-        return damping, damping
+        return (), _scalar(self.initial, info)
+
+    def propose(self, state: tuple[()], step: StepInfo) -> tuple[tuple[()], Array]:
+        """See `DampingPolicy`."""
+        good = step.accepted & (step.gain_ratio > self.good_gain)
+        damping = step.damping * jnp.where(good, self.success, self.failure)
+        return (), jnp.clip(damping, self.minimum, self.maximum).astype(step.damping.dtype)
+
+
+@register_pytree
+@dataclass(frozen=True)
+class Classic(Geometric):
+    """The paper's baseline: halve after a good step, double otherwise.
+
+    Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain threshold
+    0.4 as in the authors' released code, since the printed text swaps them. A step that lowers the cost is
+    always accepted.
+    """
+
+    initial: float = 0.25
+    success: float = 0.5
+    failure: float = 2.0
+    minimum: float = 0.0
+    maximum: float = LARGEST
+    good_gain: float = 0.4
 
 
 def gtsam() -> Geometric:

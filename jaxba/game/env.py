@@ -26,8 +26,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.clock import duration
-from jaxba.damping.features import Memory, begin, observation_size, observe, record
+from jaxba.damping.features import Memory, begin, duration, observation_size, observe, record
 from jaxba.damping.guard import action_of, damping_of
 from jaxba.damping.rules import Ceres
 from jaxba.game.devices import all_rows, own_rows
@@ -64,9 +63,8 @@ class GameConfig:
 
     reward: Reward = "duration"
     """Of an iteration. `duration`: minus a deterministic cost of the iteration. `clock`: minus its duration by a clock,
-    which varies as measured ones do (`damping/clock.py`). `constant`: -1. `reduction`: zero, and the bonus shrinks with
-    every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's reversed roles of state
-    and reward)."""
+    which varies as measured ones do. `constant`: -1. `reduction`: zero, and the bonus shrinks with every iteration.
+    `reversed`: minus log10 of the cost over the best known cost (the paper's reversed roles of state and reward)."""
 
     bonus: float = 10.0
     """Added if the episode ends in success. Source: Belder et al. 2023."""

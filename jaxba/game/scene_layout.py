@@ -22,19 +22,17 @@ def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
     Random clusters, if the options ask for them, are those of a scene in which every camera sees every point, so that
     all scenes of a class share them.
     """
-    return _layout(kind, options.cluster_cameras)
+    return _layout(kind, StepOptions(method=options.method) if options.cluster_cameras else StepOptions())
 
 
 @functools.cache
-def _layout(kind: SceneClass, partitions: int | None) -> Layout:
+def _layout(kind: SceneClass, options: StepOptions) -> Layout:
     count = kind.cameras * kind.points
     camera, point = np.tile(np.arange(kind.cameras), kind.points), np.repeat(np.arange(kind.points), kind.cameras)
     cameras = np.zeros((kind.cameras, 9))
     problem = BundleProblem.create(cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point)
-    if partitions is not None:
-        return build_layout(problem, factor=False, partitions=partitions)
-    layout = build_layout(problem)
-    if layout.grid is None:
+    layout = build_layout(problem, options)
+    if layout.grid is None and options.factors_reduced_system:
         raise AssertionError("scenes of the game are dense")
     return layout
 

@@ -48,9 +48,9 @@ class BandFactor(NamedTuple):
 
         def forward(before: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             right_tile, inverse, below = row
-            half = jnp.matmul(inverse, right_tile - before[:size], precision="highest")
-            after = jnp.concatenate([before, jnp.zeros(size, right.dtype)])[size:]
-            return after + jnp.matmul(below, half, precision="highest"), half
+            known = jnp.concatenate([before, jnp.zeros(size, right.dtype)])  # from earlier tiles
+            half = jnp.matmul(inverse, right_tile - known[:size], precision="highest")
+            return known[size:] + jnp.matmul(below, half, precision="highest"), half
 
         def backward(after: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             half, inverse, below = row
@@ -59,16 +59,9 @@ class BandFactor(NamedTuple):
             return jnp.concatenate([x, after])[:rest], x
 
         nothing = jnp.zeros(rest, right.dtype)
-        # contributions of earlier tiles to the next `rest` rows; none for a block-diagonal matrix
-        padded = nothing if rest else jnp.zeros(size, right.dtype)
-        _, halves = lax.scan(forward if rest else _diagonal_forward, padded, (rights, self.inverses, self.below))
+        _, halves = lax.scan(forward, nothing, (rights, self.inverses, self.below))
         _, x = lax.scan(backward, nothing, (halves, self.inverses, self.below), reverse=True)
         return take_rows(x.reshape(-1, right.shape[1]), self.band.rank)
-
-
-def _diagonal_forward(nothing: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    right_tile, inverse, _ = row
-    return nothing, jnp.matmul(inverse, right_tile, precision="highest")
 
 
 def band_factor(band: Band, blocks: Float[Array, "blocks width width"]) -> BandFactor:

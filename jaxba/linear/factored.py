@@ -12,13 +12,11 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba.linear.band_cholesky import band_factor
-from jaxba.linear.blocks import dense_blocks
 from jaxba.linear.border import Solve, bordered, without_lenses
 from jaxba.linear.cholesky import factor_and_solve, factor_panels
-from jaxba.linear.formed import dense_coupling, dense_system, grid_of, pairs_of, reduced_blocks
-from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced
+from jaxba.linear.formed import dense_blocks, dense_coupling, dense_system, reduced_blocks
+from jaxba.linear.schur import DampedSystem, apply_reduced
 from jaxba.linear.woodbury import capacitance_solve
-from jaxba.model.linearize import Linearization
 from jaxba.structure.camera_ordering import Band
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.density import has_few_points
@@ -35,25 +33,20 @@ def in_full(layout: Layout) -> bool:
     return layout.unknowns.poses.several or _by_woodbury(layout)
 
 
-def factored(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, *, rough: bool = False
-) -> Solve:
+def factored(system: DampedSystem, *, rough: bool = False) -> Solve:
     """`T (T^T S T)^-1 T^T`. Its result is non-finite if S is not positive definite.
 
     Args:
-        layout: the problem's observations.
-        linear: residuals and Jacobians.
-        points: the eliminated points.
-        system: B + D_c.
+        system: B + D_c and what is eliminated.
         rough: for a preconditioner in float32. The diagonal is scaled to one and shifted, so that the factor exists.
     """
-    unknowns = layout.unknowns
+    layout, unknowns = system.layout, system.layout.unknowns
     if _by_woodbury(layout):
-        wide = dense_coupling(grid_of(layout), linear, points)
-        return lambda right: capacitance_solve(wide, system._replace(right=right))
+        wide = dense_coupling(system)
+        return lambda right: capacitance_solve(wide, system.cameras.blocks, right)
     if layout.grid is not None:
-        return _merged(unknowns, dense_system(layout, linear, points, system), rough)
-    pairs, blocks = pairs_of(layout), reduced_blocks(layout, linear, points, system)
+        return _merged(unknowns, dense_system(system), rough)
+    pairs, blocks = layout.part("pairs"), reduced_blocks(system)
     if unknowns.poses.several:
         return _merged(unknowns, dense_blocks(pairs, blocks), rough)
     kept = without_lenses(unknowns, pairs, blocks)
@@ -62,8 +55,8 @@ def factored(
         inner = lambda x: solve(x.reshape(-1, *x.shape[2:])).reshape(x.shape)
     else:
         inner = _banded(pairs, pairs.band, kept, rough)
-    product = lambda x: apply_reduced(layout, linear, points, system, x)
-    return bordered(unknowns, product, inner, system.right, store=rough)
+    product = lambda x: apply_reduced(system, x)
+    return bordered(unknowns, product, inner, system.cameras.right, store=rough)
 
 
 def _by_woodbury(layout: Layout) -> bool:

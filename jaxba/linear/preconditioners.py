@@ -17,15 +17,13 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
 from jaxba.linear.cholesky import lower_cholesky
-from jaxba.linear.schur import CameraSystem, PointSystem
-from jaxba.linear.two_level import Anchor, coarse_preconditioner
-from jaxba.model.linearize import Linearization
+from jaxba.linear.schur import DampedSystem
+from jaxba.linear.two_level import coarse_preconditioner
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import Preconditioner
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.fusion import fusion_barrier
 from jaxba.structure.devices import sum_over_devices
-from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 from jaxba.structure.unknowns import Unknowns
 
@@ -33,35 +31,20 @@ Operator = Callable[[Array], Array]
 
 
 def preconditioner(
-    layout: Layout,
-    linear: Linearization,
-    points: PointSystem,
-    system: CameraSystem,
-    anchor: Anchor,
-    blocks: Float[Array, "blocks width width"] | None,
-    name: Preconditioner,
+    system: DampedSystem, blocks: Float[Array, "blocks width width"] | None, name: Preconditioner
 ) -> Operator:
-    """`M^-1` as a function of the residual.
-
-    Args:
-        layout: the problem's observations, with camera clusters for `two-level`.
-        linear: residuals and Jacobians.
-        points: the eliminated points.
-        system: damped camera blocks.
-        anchor: current poses and points, for `two-level`.
-        blocks: the blocks of S, if they have been formed.
-        name: which one.
-    """
+    """`M^-1` as a function of the residual; `blocks` are those of S, if they have been formed."""
+    layout = system.layout
     if name == "jacobi":
-        return block_inverse(_with_shared(layout.unknowns, system.blocks))
+        return block_inverse(_with_shared(layout.unknowns, system.cameras.blocks))
     if blocks is None or layout.pairs is None:
-        diagonal = diagonal_blocks(layout, linear, points, system)
+        diagonal = diagonal_blocks(system)
     else:
         diagonal = take_rows(blocks, layout.pairs.diagonal)
     fine = block_inverse(_with_shared(layout.unknowns, diagonal))
     if name == "schur-jacobi":
         return fine
-    coarse = coarse_preconditioner(layout, linear, points, system, anchor)
+    coarse = coarse_preconditioner(system)
     return lambda r: fine(r) + coarse(r)
 
 
@@ -80,26 +63,24 @@ def _with_shared(
     return jnp.concatenate([upper, jnp.concatenate([coupling.mT, lens], axis=2)], axis=1)
 
 
-def diagonal_blocks(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
-) -> Float[Array, "cameras width width"]:
+def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]:
     """The diagonal blocks of S, `D_c` (and priors) `+ sum J_c^T (I - Q Q^T) J_c`.
 
     With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
     observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the
     two observations is missing, which is harmless in a preconditioner.
     """
-    over, under = points.projected
+    layout, (over, under) = system.layout, system.points.projected
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     f00 = safe_sqrt(jnp.maximum(1 - dot(over, over), 0))
     f10 = -dot(over, under) / jnp.where(f00 > 0, f00, 1)
     f11 = safe_sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))
     f00, f10, f11 = fusion_barrier(jnp.stack([f00, f10, f11]))
-    first, second = linear.camera_jacobian
+    first, second = system.linear.camera_jacobian
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels
     gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, len(first))
-    return system.own + sum_over_devices(layout, tree_sum(outer_sum(gathered, gathered), tuple(levels)))
+    return system.cameras.own + sum_over_devices(layout, tree_sum(outer_sum(gathered, gathered), tuple(levels)))
 
 
 def block_inverse(blocks: Float[Array, "cameras width width"]) -> Callable[[Array], Array]:

@@ -16,7 +16,7 @@ Jacobians `J_c` [2, width] and `J_p` [2, 3]:
 The projected residual `r - Q h` in b avoids the cancellation between its two terms.
 
 Rotations are perturbed on the manifold, `R <- exp(d) R`; damping is diagonal in the coordinates of the options
-(`RotationCoordinates`).
+(`rotation_coordinates`).
 
 Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 6; Agarwal et al. 2010, "Bundle Adjustment
 in the Large", section 3.
@@ -26,18 +26,17 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.rotations import left_jacobian, left_jacobian_inverse
 from jaxba.runtime.fusion import compute_in_one_loop
-from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import (
@@ -50,26 +49,17 @@ from jaxba.structure.segment_sums import (
     tree_sum,
 )
 
+RotationCoordinates = tuple[Float[Array, "cameras 3 3"], Float[Array, "cameras 3 3"]]
+"""Maps of rotation steps, to first order: from coordinates in which damping is diagonal to the manifold, and back."""
 
-class RotationCoordinates(NamedTuple):
-    """Maps rotation steps between the manifold and the coordinates in which damping is diagonal, to first order."""
 
-    forward: Float[Array, "cameras 3 3"]  # options' coordinates -> manifold
-    inverse: Float[Array, "cameras 3 3"]
-
-    @classmethod
-    def of(cls, cameras: Float[Array, "parameters cameras"], options: StepOptions) -> RotationCoordinates:
-        """The left Jacobian of SO(3) for angle-axis coordinates, the identity for manifold coordinates."""
-        if options.coordinates.rotation == "manifold":
-            one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
-            return cls(one, one)
-        to_front = lambda m: jnp.moveaxis(m, -1, 0)
-        return cls(to_front(left_jacobian(cameras[:3])), to_front(left_jacobian_inverse(cameras[:3])))
-
-    def from_manifold(self, step: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
-        """A manifold step in the options' coordinates."""
-        rotation = jnp.einsum("cij,cj->ci", self.inverse, step[:, :3])
-        return jnp.concatenate([rotation, step[:, 3:]], axis=1)
+def rotation_coordinates(cameras: Float[Array, "parameters cameras"], options: StepOptions) -> RotationCoordinates:
+    """The left Jacobian of SO(3) and its inverse for angle-axis coordinates, the identity for manifold coordinates."""
+    if options.coordinates.rotation == "manifold":
+        one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
+        return one, one
+    to_front = lambda m: jnp.moveaxis(m, -1, 0)
+    return to_front(left_jacobian(cameras[:3])), to_front(left_jacobian_inverse(cameras[:3]))
 
 
 class PointSystem(NamedTuple):
@@ -95,17 +85,41 @@ class CameraSystem(NamedTuple):
     rows: Float[Array, "chunks terms columns"] | None = None
 
 
+class DampedSystem(NamedTuple):
+    """The damped normal equations `(H + D) d = -g` of one iteration, points eliminated."""
+
+    layout: Layout
+    linear: Linearization
+    points: PointSystem
+    cameras: CameraSystem
+    damping: Float[Array, ""]  # lambda
+    parameters: tuple[Float[Array, "parameters cameras"], Float[Array, "3 points"]]  # current ones
+    coordinates: RotationCoordinates  # in which the damping is diagonal
+    forcing: float | Float[Array, ""] = 0.0  # where conjugate gradients stop, if they are used
+    iteration: int | Int[Array, ""] = 0  # from 0
+    state: Any = ()  # of the method (`lm.method.StepMethod.begin`)
+
+    @classmethod
+    def of(
+        cls,
+        layout: Layout,
+        linear: Linearization,
+        cameras: Float[Array, "parameters cameras"],
+        points: Float[Array, "3 points"],
+        damping: Float[Array, ""],
+        options: StepOptions,
+    ) -> DampedSystem:
+        """That of a linear model at current cameras and points."""
+        coordinates = rotation_coordinates(cameras, options)
+        eliminated = eliminate_points(layout, linear, damping, options)
+        reduced = camera_system(layout, linear, eliminated, coordinates, damping, options)
+        return cls(layout, linear, eliminated, reduced, damping, (cameras, points), coordinates)
+
+
 def eliminate_points(
     layout: Layout, linear: Linearization, damping: Float[Array, ""], options: StepOptions
 ) -> PointSystem:
-    """Forms, damps and factors the 3 x 3 block of every point.
-
-    Args:
-        layout: the problem's observations.
-        linear: residuals and Jacobians.
-        damping: lambda.
-        options: scaling of the damping.
-    """
+    """Forms, damps and factors the 3 x 3 block of every point."""
     sums = point_sums(layout, normal_entries(linear.point_jacobian, linear.residual))
 
     def factored(sums: list[Array], damping: Array) -> list[Array]:
@@ -139,14 +153,6 @@ def camera_system(
 
     `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b in its columns: one pass over
     the observations for all three.
-
-    Args:
-        layout: the problem's observations.
-        linear: residuals and Jacobians.
-        points: the eliminated points.
-        coordinates: in which the damping is diagonal.
-        damping: lambda.
-        options: scaling of the damping, and its factor for cameras.
     """
     solved = take(jnp.stack(points.solved), layout.slot_point)
     rows = []
@@ -154,13 +160,13 @@ def camera_system(
         reduced = linear.residual[k] - sum(points.projected[k][i] * solved[i] for i in range(3))
         rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
     level, *levels = layout.camera_levels
-    width = len(linear.camera_jacobian[0])
+    width, (forward, inverse) = len(linear.camera_jacobian[0]), coordinates
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
-    for priors in linear.priors:
-        blocks, gradient, right = blocks + priors.blocks, gradient + priors.gradient, right - priors.gradient
-    rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
+    for own, slope in linear.priors:
+        blocks, gradient, right = blocks + own, gradient + slope, right - slope
+    rotation = jnp.einsum("cji,cjk,ckl->cil", forward, blocks[:, :3, :3], forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
@@ -168,27 +174,23 @@ def camera_system(
     extra = layout.unknowns.shares(damping_diagonal(layout.unknowns.sums(diagonal), factor, options))
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
-    on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
+    on_manifold = jnp.einsum("cji,cj,cjk->cik", inverse, extra[:, :3], inverse)
     added = extra[:, :, None] * jnp.eye(width, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(on_manifold)
-    own = sum((priors.blocks for priors in linear.priors), added)
+    own = sum((block for block, _ in linear.priors), added)
     return CameraSystem(blocks + added, own, gradient, right, extra, gathered)
 
 
-def back_substitute(
-    layout: Layout, linear: Linearization, points: PointSystem, step: Float[Array, "cameras width"]
-) -> list[Array]:
+def back_substitute(system: DampedSystem, step: Float[Array, "cameras width"]) -> list[Array]:
     """Point step `-L^-T (h + sum Y^T d_c)` of a camera step on the manifold, [3] of (points,)."""
-    inner = project_to_points(layout, linear, points, step)
+    points, inner = system.points, project_to_points(system, step)
     return [-x for x in points.factor.backward([h + w for h, w in zip(points.solved, inner, strict=True)])]
 
 
-def apply_reduced(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, x: Float[Array, "cameras width"]
-) -> Float[Array, "cameras width"]:
+def apply_reduced(system: DampedSystem, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
     """`S x = (B + D_c) x - sum Y (Y^T x)` without forming S, in two passes over the observations."""
-    inner = project_to_points(layout, linear, points, x)
-    at_slot = take(jnp.stack(inner), layout.slot_point)
+    layout, linear, points = system[:3]
+    at_slot = take(jnp.stack(project_to_points(system, x)), layout.slot_point)
 
     def lifted(at_slot: Array, projected: list[list[Array]], first: list[Array], second: list[Array]) -> list[Array]:
         over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
@@ -196,67 +198,66 @@ def apply_reduced(
 
     rows = as_rows(compute_in_one_loop(lifted, at_slot, points.projected, *linear.camera_jacobian))
     eliminated = sum_over_devices(layout, tree_sum(rows, layout.camera_levels))
-    return jnp.einsum("cab,cb->ca", system.blocks, x) - eliminated
+    return jnp.einsum("cab,cb->ca", system.cameras.blocks, x) - eliminated
 
 
-def lift_to_cameras(layout: Layout, linear: Linearization, points: PointSystem) -> Float[Array, "cameras width"]:
+def lift_to_cameras(system: DampedSystem) -> Float[Array, "cameras width"]:
     """`E (C + D_p)^-1 g_p = sum Y h` of every camera, for the solved gradients h of the points."""
+    layout, linear, points = system[:3]
     solved = take(jnp.stack(points.solved), layout.slot_point)
     over, under = (sum(points.projected[k][i] * solved[i] for i in range(3)) for k in range(2))
     rows = as_rows([a * over + b * under for a, b in zip(*linear.camera_jacobian, strict=True)])
     return sum_over_devices(layout, tree_sum(rows, layout.camera_levels))
 
 
-def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "sorted three_width"]:
+def coupling_by_camera(system: DampedSystem) -> Float[Array, "sorted three_width"]:
     """`Y^T` [3, width] of every observation, flattened, sorted by camera (structure/layout.py)."""
-    assert system.rows is not None
+    layout, _, points, cameras = system[:4]
+    assert cameras.rows is not None
     over, under = points.projected
     projected = take_rows(as_rows([*over, *under]), layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
-    width = system.blocks.shape[-1]
-    rows = system.rows[..., :width].reshape(-1, 2, width)
+    width = cameras.blocks.shape[-1]
+    rows = cameras.rows[..., :width].reshape(-1, 2, width)
     return outer_sum(projected, rows).reshape(-1, 3 * width)
 
 
-def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "slots three_width"]:
+def coupling_rows(system: DampedSystem) -> Float[Array, "slots three_width"]:
     """`Y^T` [3, width] of every slot, flattened."""
-    first, second = linear.camera_jacobian
-    over, under = points.projected
+    first, second = system.linear.camera_jacobian
+    over, under = system.points.projected
     columns = [a * over[i] + b * under[i] for i in range(3) for a, b in zip(first, second, strict=True)]
     return as_rows(columns)
 
 
-def project_to_points(
-    layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras width"]
-) -> list[Array]:
+def project_to_points(system: DampedSystem, x: Float[Array, "cameras width"]) -> list[Array]:
     """`sum Y^T x` over each point's observations, [3] of (points,)."""
-    at_slot = take(components_first(x), layout.slot_camera)
+    at_slot = take(x.T, system.layout.slot_camera)
 
     def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
         over, under = (sum(a * x for a, x in zip(row, at_slot, strict=True)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
-    return point_sums(layout, compute_in_one_loop(inner, at_slot, points.projected, linear.camera_jacobian))
+    terms = compute_in_one_loop(inner, at_slot, system.points.projected, system.linear.camera_jacobian)
+    return point_sums(system.layout, terms)
 
 
 def jacobian_product(
     layout: Layout, linear: Linearization, cameras: Float[Array, "cameras width"], points: Float[Array, "3 points"]
 ) -> list[Array]:
     """`J d` of every slot for a step on the manifold, [2] of (slots,), pixels."""
-    by_camera, by_point = take_each(components_first(cameras), layout.slot_camera), take_each(points, layout.slot_point)
+    by_camera, by_point = take_each(cameras.T, layout.slot_camera), take_each(points, layout.slot_point)
     rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
     dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
     return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]
 
 
-def largest_gradient(
-    layout: Layout, points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates
-) -> Float[Array, ""]:
+def largest_gradient(system: DampedSystem) -> Float[Array, ""]:
     """Largest absolute entry of the gradient, in the options' coordinates."""
-    gradient = layout.unknowns.sums(system.gradient)
-    rotation = jnp.einsum("cji,cj->ci", coordinates.forward, gradient[:, :3])
-    parts = rotation, gradient[:, 3:], jnp.stack(points.gradient)
+    gradient = system.layout.unknowns.sums(system.cameras.gradient)
+    rotation = jnp.einsum("cji,cj->ci", system.coordinates[0], gradient[:, :3])
+    parts = rotation, gradient[:, 3:], jnp.stack(system.points.gradient)
     largest = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts if part.size])
-    return max_over_devices(layout, largest)
+    return max_over_devices(system.layout, largest)
 
 
 def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:

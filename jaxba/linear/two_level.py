@@ -17,18 +17,17 @@ and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.linear.blocks import dense_blocks, pair_products
 from jaxba.linear.cholesky import factor_panels
-from jaxba.linear.schur import CameraSystem, PointSystem
-from jaxba.model.linearize import Linearization
+from jaxba.linear.formed import dense_blocks, pair_products
+from jaxba.linear.schur import DampedSystem
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.rotations import rotation_matrix
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.camera_clusters import ClusterLayout
 from jaxba.structure.devices import sum_over_devices
@@ -48,43 +47,33 @@ COARSE_PANEL = 256
 within 2%, and a second less of compilation."""
 
 
-class Anchor(NamedTuple):
-    """Current poses and points, at which the columns of P are computed."""
-
-    rotation: Float[Array, "3 3 cameras"]
-    translation: Float[Array, "3 cameras"]
-    points: Float[Array, "3 points"]
-
-
-def camera_modes(layout: Layout, anchor: Anchor, width: int) -> Float[Array, "cameras width modes"]:
+def camera_modes(
+    layout: Layout, cameras: Float[Array, "parameters cameras"], width: int
+) -> Float[Array, "cameras width modes"]:
     """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for unseen cameras.
 
     For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all projections is
     `-R a` for the rotation and `-R b + s t` for the translation.
     """
-    minus_rotation = -jnp.moveaxis(anchor.rotation, -1, 0)
+    minus_rotation = -jnp.moveaxis(rotation_matrix(cameras[:3]), -1, 0)
     count = minus_rotation.shape[0]
     numbers = width - POSE_SIZE
     zeros = lambda *shape: jnp.zeros((count, *shape), minus_rotation.dtype)
     rotation = jnp.concatenate([minus_rotation, zeros(3, 4 + numbers)], axis=2)
-    translation = jnp.concatenate(
-        [zeros(3, 3), minus_rotation, anchor.translation.T[:, :, None], zeros(3, numbers)], axis=2
-    )
+    translation = jnp.concatenate([zeros(3, 3), minus_rotation, cameras[3:6].T[:, :, None], zeros(3, numbers)], axis=2)
     lens = jnp.eye(numbers, SIMILARITY + numbers, SIMILARITY, dtype=minus_rotation.dtype)
     lens = jnp.broadcast_to(lens, (count, *lens.shape))
     modes = jnp.concatenate([rotation, translation, lens], axis=1)
     return jnp.where(layout.camera_seen[:, None, None], modes, jnp.zeros_like(modes))
 
 
-def coarse_preconditioner(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, anchor: Anchor
-) -> Callable[[Array], Array]:
+def coarse_preconditioner(system: DampedSystem) -> Callable[[Array], Array]:
     """The product with `P (P^T S P)^-1 P^T`; zero if the coarse system is not positive definite."""
-    clusters = _clusters(layout)
-    modes = camera_modes(layout, anchor, system.blocks.shape[-1])
+    clusters = system.layout.part("clusters")
+    modes = camera_modes(system.layout, system.parameters[0], system.cameras.blocks.shape[-1])
     apart = Sharing.of(np.arange(len(clusters.members)))
     tied = Sharing.joined((apart, SIMILARITY), (clusters.lenses, modes.shape[-1] - SIMILARITY))
-    matrix = tied.merged(coarse_system(layout, linear, points, system, anchor, modes))
+    matrix = tied.merged(coarse_system(system, modes))
     diagonal = jnp.diagonal(matrix)
     scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
     unknowns = matrix.shape[0]
@@ -103,18 +92,12 @@ def coarse_preconditioner(
 
 
 def coarse_system(
-    layout: Layout,
-    linear: Linearization,
-    points: PointSystem,
-    system: CameraSystem,
-    anchor: Anchor,
-    modes: Float[Array, "cameras width modes"],
+    system: DampedSystem, modes: Float[Array, "cameras width modes"]
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
-    clusters, count = _clusters(layout), modes.shape[-1]
-    products = pair_products(clusters.pairs, _shared_rows(layout, linear, points, anchor.points), count)
-    shared = sum_over_devices(layout, products)
-    own = jnp.einsum("cam,cab,cbn->cmn", modes, system.blocks, modes).reshape(-1, count**2)
+    clusters, count = system.layout.part("clusters"), modes.shape[-1]
+    shared = sum_over_devices(system.layout, pair_products(clusters.pairs, _shared_rows(system), count))
+    own = jnp.einsum("cam,cab,cbn->cmn", modes, system.cameras.blocks, modes).reshape(-1, count**2)
     own = cluster_sum(clusters, own)
     own = jnp.concatenate([own, jnp.zeros((1, count**2), own.dtype)])
     blocks = take_rows(own, clusters.pairs.block_camera) - shared
@@ -127,30 +110,22 @@ def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Flo
     return jnp.sum(take_rows(padded, clusters.members), axis=1)
 
 
-def _shared_rows(
-    layout: Layout, linear: Linearization, points: PointSystem, positions: Float[Array, "3 points"]
-) -> Float[Array, "coarse rows"]:
+def _shared_rows(system: DampedSystem) -> Float[Array, "coarse rows"]:
     """`(J_c P)^T Q`, transposed and flattened, summed over the observations of each point by each cluster.
 
     These observations have the point X in common, so that only `J_p^T Q` and the columns of the lenses are summed.
     """
-    clusters = _clusters(layout)
-    over, under = points.projected
+    clusters, linear = system.layout.part("clusters"), system.linear
+    over, under = system.points.projected
     (first, second), (high, low) = linear.point_jacobian, linear.camera_jacobian
     moved = [[first[k] * over[i] + second[k] * under[i] for k in range(3)] for i in range(3)]
     numbers = range(POSE_SIZE, len(high))
     lens = [[high[k] * over[i] + low[k] * under[i] for k in numbers] for i in range(3)]
     columns = [column for i in range(3) for column in moved[i] + lens[i]]
     sums = compute_unfused(lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point).T
-    x, y, z = take_each(positions, clusters.point)
+    x, y, z = take_each(system.parameters[1], clusters.point)
     rows = []
     for i in range(3):
         p, q, r, *own = sums.reshape(3, -1, sums.shape[-1])[i]
         rows += [q * z - r * y, r * x - p * z, p * y - q * x, -p, -q, -r, -(p * x + q * y + r * z), *own]
     return as_rows(rows)
-
-
-def _clusters(layout: Layout) -> ClusterLayout:
-    if layout.clusters is None:
-        raise ValueError("this layout has no clusters: build it with clusters=True for the two-level preconditioner")
-    return layout.clusters

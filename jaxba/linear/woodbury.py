@@ -20,26 +20,25 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
 from jaxba.linear.cholesky import factor_and_solve, lower_cholesky
-from jaxba.linear.schur import CameraSystem
 
 
-def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSystem) -> Float[Array, "cameras width"]:
+def capacitance_solve(
+    wide: Float[Array, "unknowns columns"],
+    blocks: Float[Array, "cameras width width"],
+    right: Float[Array, "cameras width"],
+) -> Float[Array, "cameras width"]:
     """Solves `(B - W W^T) x = b`.
-
-    Args:
-        wide: W; its rows are sorted by camera.
-        system: B, damping included, and b.
 
     Returns:
         The camera step; non-finite if S is not positive definite.
     """
-    factor = lower_cholesky(system.blocks)
+    factor = lower_cholesky(blocks)
     width = factor.shape[-1]
     unit = jnp.broadcast_to(jnp.eye(width, dtype=factor.dtype), factor.shape)
     inverse = solve_triangular(factor, unit, lower=True)  # [cameras, width, width]
     # matmul instead of a fused sum: XLA would recompute W for every row of the result
     scaled = jnp.matmul(inverse, wide.reshape(len(inverse), width, -1), precision="highest").reshape(wide.shape)
-    half = jnp.matmul(inverse, system.right[:, :, None], precision="highest").reshape(-1)
+    half = jnp.matmul(inverse, right[:, :, None], precision="highest").reshape(-1)
     capacitance = jnp.eye(wide.shape[1], dtype=wide.dtype) - jnp.matmul(scaled.T, scaled, precision="highest")
     inner = factor_and_solve(capacitance, jnp.matmul(half, scaled, precision="highest"))
     whole = half + jnp.matmul(scaled, inner, precision="highest")

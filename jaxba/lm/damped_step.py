@@ -26,21 +26,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.linear.schur import (
-    CameraSystem,
-    PointSystem,
-    RotationCoordinates,
-    back_substitute,
-    camera_system,
-    eliminate_points,
-    jacobian_product,
-    largest_gradient,
-)
-from jaxba.linear.step import Step
-from jaxba.lm.method import DampedSystem, method_of
+from jaxba.linear.schur import DampedSystem, back_substitute, jacobian_product, largest_gradient
+from jaxba.lm.method import method_of
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
-from jaxba.structure.conventions import components_first
+from jaxba.refinement.acceptance import Step
 from jaxba.structure.devices import max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
@@ -72,40 +62,33 @@ def solve_step(
         The step. It is non-finite if a factorisation failed; the caller rejects such a step.
     """
     forcing = (options.truncated or options.conjugate_gradients).forcing
-    coordinates = RotationCoordinates.of(cameras, options)
-    eliminated = eliminate_points(layout, linear, damping, options)
-    reduced = camera_system(layout, linear, eliminated, coordinates, damping, options)
-    at = cameras, points
-    system = DampedSystem(layout, linear, eliminated, reduced, damping, at, iteration, forcing, method_state)
+    system = DampedSystem.of(layout, linear, cameras, points, damping, options)
+    system = system._replace(forcing=forcing, iteration=iteration, state=method_state)
     solution = method_of(options).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
     point_step = solution.points
     if point_step is None:
-        point_step = jnp.stack(back_substitute(layout, linear, eliminated, manifold_step))
-    camera_step = coordinates.from_manifold(manifold_step)
-    slope, damped = _slope_and_damping(layout, eliminated, reduced, manifold_step, camera_step, point_step)
+        point_step = jnp.stack(back_substitute(system, manifold_step))
+    rotation = jnp.einsum("cij,cj->ci", system.coordinates[1], manifold_step[:, :3])
+    camera_step = jnp.concatenate([rotation, manifold_step[:, 3:]], axis=1)
+    slope, damped = _slope_and_damping(system, manifold_step, camera_step, point_step)
     if not solution.residual_orthogonal:
         # d.e is not zero: `-g.d - d.H d` takes the place of d.D d, with d.H d = |J d|^2
         change = jacobian_product(layout, linear, manifold_step, point_step)
         damped = slope - sum_over_devices(layout, sum(jnp.sum(m * m) for m in change))
     return Step(
-        layout.unknowns.expanded(components_first(camera_step)),
+        layout.unknowns.expanded(camera_step.T),
         point_step,
         slope,
         damped,
-        largest_gradient(layout, eliminated, reduced, coordinates),
+        largest_gradient(system),
         solution.iterations,
         jnp.asarray(forcing if options.truncated else 0.0, cameras.dtype),
     )
 
 
 def _slope_and_damping(
-    layout: Layout,
-    points: PointSystem,
-    system: CameraSystem,
-    manifold_step: Array,
-    camera_step: Array,
-    point_step: Array,
+    system: DampedSystem, manifold_step: Array, camera_step: Array, point_step: Array
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`-g.d` and `d.D d`, whose sum gives the decrease of the linear model without cancellation.
 
@@ -116,10 +99,11 @@ def _slope_and_damping(
     `d.e` is zero for a factorisation, for conjugate gradients started at zero, and for the best step of a subspace. The
     two terms that are left are positive.
     """
+    points, cameras = system.points, system.cameras
     of_points = jnp.sum(jnp.stack(points.gradient) * point_step), jnp.sum(jnp.stack(points.damping) * point_step**2)
-    slope, damped = sum_over_devices(layout, of_points)
-    slope = jnp.sum(system.gradient * manifold_step) + slope
-    return -slope, jnp.sum(system.damping * camera_step**2) + damped
+    slope, damped = sum_over_devices(system.layout, of_points)
+    slope = jnp.sum(cameras.gradient * manifold_step) + slope
+    return -slope, jnp.sum(cameras.damping * camera_step**2) + damped
 
 
 def largest_diagonal(layout: Layout, linear: Linearization) -> Float[Array, ""]:

@@ -14,43 +14,8 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.linear.reduced_system import solve_reduced
-from jaxba.linear.schur import CameraSystem, PointSystem
-from jaxba.linear.two_level import Anchor
-from jaxba.model.linearize import Linearization
+from jaxba.linear.schur import DampedSystem
 from jaxba.problem.options import MethodTraits, StepOptions
-from jaxba.rotations import rotation_matrix
-from jaxba.structure.layout import Layout
-
-
-class DampedSystem(NamedTuple):
-    """The damped normal equations `(H + D) d = -g` of one iteration, points eliminated."""
-
-    layout: Layout
-    """The problem's observations."""
-
-    linear: Linearization
-    """Residuals and Jacobians."""
-
-    points: PointSystem
-    """The eliminated points."""
-
-    cameras: CameraSystem
-    """Blocks, gradient and right-hand side of the cameras."""
-
-    damping: Float[Array, ""]
-    """Lambda."""
-
-    parameters: tuple[Float[Array, "parameters cameras"], Float[Array, "3 points"]]
-    """Current cameras and points."""
-
-    iteration: int | Int[Array, ""]
-    """Number of the iteration, from 0."""
-
-    forcing: float | Float[Array, ""]
-    """Forcing term of truncated conjugate gradients, where they are used."""
-
-    state: Any
-    """State of the method, see `StepMethod.begin`."""
 
 
 class MethodStep(NamedTuple):
@@ -64,9 +29,6 @@ class MethodStep(NamedTuple):
 
 class StepMethod(MethodTraits, ABC):
     """A way to compute the step of an iteration."""
-
-    description: str
-    """One line for the user."""
 
     rule: str = "ceres"
     """Name of the damping rule that the method was published with."""
@@ -98,7 +60,6 @@ class LevenbergMarquardt(StepMethod):
     """The method `lm`, which options without a method mean."""
 
     name = "lm"
-    description = "Levenberg-Marquardt: one reduced camera system, factored or by conjugate gradients"
 
     def options(self, base: StepOptions) -> StepOptions:
         """See `StepMethod`."""
@@ -106,9 +67,7 @@ class LevenbergMarquardt(StepMethod):
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
-        cameras, points = system.parameters
-        anchor = Anchor(rotation_matrix(cameras[:3]), cameras[3:6], points)
-        step, iterations = solve_reduced(*system[:4], anchor, options, system.forcing)
+        step, iterations = solve_reduced(system, options)
         return MethodStep(step, None, iterations, residual_orthogonal=True)
 
 

@@ -82,12 +82,6 @@ class StepInfo(NamedTuple):
     repairs: Int[Array, ""]
     """Number of camera rounds, backtracking trials and pattern moves after the first candidate."""
 
-    camera_rounds: Int[Array, ""]
-    """The camera rounds among them."""
-
-    point_iterations: Int[Array, ""]
-    """Embedded point iterations of all candidates, as many as each might make."""
-
     @classmethod
     def stacked(cls, steps: Sequence[StepInfo]) -> StepInfo:
         """The records of several iterations as one, of NumPy arrays."""
@@ -98,6 +92,5 @@ class StepInfo(NamedTuple):
     __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
 
 
-KINDS: dict[str, Any] = {"accepted": bool, "weightless": bool}
-KINDS |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), np.int32)
+KINDS: dict[str, Any] = {"accepted": bool, "weightless": bool, "cg_iterations": np.int32, "repairs": np.int32}
 """Types of the fields of a record that are no floating point numbers."""

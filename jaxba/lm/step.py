@@ -23,7 +23,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Step
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.method import check_plain, method_of
 from jaxba.lm.records import LMState, StepInfo
@@ -32,12 +31,12 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
-from jaxba.refinement.acceptance import Candidate, comparison
+from jaxba.refinement.acceptance import Candidate, Step, comparison
 from jaxba.refinement.candidates import best_candidate
 from jaxba.runtime.numerics import check_x64, for_traces
-from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
 
 
 class Proposal(NamedTuple):
@@ -61,10 +60,21 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
     check_x64(problem.cameras.dtype if dtype is None else dtype)
     if layout.unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + layout.unknowns.size:
         raise ValueError("a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it")
-    cameras = components_first(jnp.asarray(problem.cameras, dtype))
+    return state_of(layout, problem.cameras, problem.points, options, dtype)
+
+
+def state_of(
+    layout: Layout,
+    cameras: Float[AnyArray, "cameras parameters"],
+    points: Float[AnyArray, "points 3"],
+    options: StepOptions,
+    dtype=None,
+) -> LMState:
+    """`initial_state` of a problem's cameras and points."""
+    parameters = jnp.asarray(cameras, dtype).T
     # padding points have an index out of range and are placed at the origin
-    points = components_first(jnp.asarray(problem.points, dtype).at[layout.points].get(mode="fill", fill_value=0))
-    return state_at(cameras, points, cost(layout, cameras, points, options.loss), options)
+    positions = jnp.asarray(points, dtype).at[layout.points].get(mode="fill", fill_value=0).T
+    return state_at(parameters, positions, cost(layout, parameters, positions, options.loss), options)
 
 
 def state_at(
@@ -172,7 +182,7 @@ def take_step(
         step_fraction=candidate.step_fraction,
         damping_fraction=jnp.clip(safe_divide(step.damped, step.slope), 0, 1),
         weightless=proposal.weightless,
-        **candidate.work._asdict(),
+        repairs=candidate.repairs,
     )
 
 

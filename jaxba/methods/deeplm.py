@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, PointSystem, jacobian_product
-from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.linear.schur import CameraSystem, DampedSystem, PointSystem, jacobian_product
+from jaxba.lm.method import MethodStep
 from jaxba.methods.subspace import SubspaceMethod, best_in_span
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import ConjugateGradients, StepOptions
@@ -38,7 +38,6 @@ class GlobalConjugateGradients(SubspaceMethod):
     """Stopping rule; the preconditioner field is ignored. Source of 1e-3 and 150: the authors' code."""
 
     name = "deeplm"
-    description = "DeepLM's global solver: conjugate gradients on cameras and points together"
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""

@@ -19,8 +19,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, apply_reduced
-from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced
+from jaxba.lm.method import MethodStep
 from jaxba.methods.subspace import SubspaceMethod, best_in_span
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.runtime import loops
@@ -34,14 +34,13 @@ class PowerSeries(SubspaceMethod):
     """Order of the series: the highest power. Source: Weber et al. 2023, section 5."""
 
     name = "poba"
-    description = "power bundle adjustment: a power series for the inverse of the reduced camera system"
 
     def __post_init__(self) -> None:
         check_count("order", self.order, 0)
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
-        product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
+        product = lambda x: apply_reduced(system, x)
         inverse = block_inverse(system.cameras.blocks)
         step = series(product, system.cameras, inverse, system.cameras.right, self.order)
         improved = options.kept_steps > 0

@@ -28,13 +28,13 @@ from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.linear.formed import reduced_blocks
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping_diagonal
-from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
+from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced, damping_diagonal
+from jaxba.lm.method import MethodStep, StepMethod
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import computed_after
-from jaxba.structure.layout import Layout, partition_of
+from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
 
@@ -59,7 +59,6 @@ class StochasticClusters(StepMethod):
     """Richardson iterations on the true system after the clusters' solution. Source: the authors' code."""
 
     name = "stba"
-    description = "stochastic bundle adjustment: random clusters of cameras, then four Richardson iterations"
     rule = "stba"
     forms_reduced_system = True
 
@@ -69,37 +68,27 @@ class StochasticClusters(StepMethod):
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
-        partition = partition_of(system.layout).at(system.iteration)
-        step = clustered_step(*system[:5], partition, options, self.repairs)
+        partition = system.layout.part("partitions").at(system.iteration)
+        step = clustered_step(system, partition, options, self.repairs)
         return MethodStep(step, None, jnp.zeros((), jnp.int32), False)
 
 
 def clustered_step(
-    layout: Layout,
-    linear: Linearization,
-    points: PointSystem,
-    system: CameraSystem,
-    damping: Float[Array, ""],
-    partition: Partition,
-    options: StepOptions,
-    repairs: int,
+    system: DampedSystem, partition: Partition, options: StepOptions, repairs: int
 ) -> Float[Array, "cameras width"]:
     """The camera step of one STBA iteration, in manifold coordinates.
 
     Args:
-        layout: the problem's observations, with pairs.
-        linear: residuals and Jacobians.
-        points: the unsplit points, eliminated.
-        system: the reduced camera system of the unsplit problem.
-        damping: lambda.
+        system: that of the unsplit problem; its layout has pairs.
         partition: the partition of this iteration.
         options: scaling of the damping.
         repairs: number of Richardson iterations.
     """
+    layout, linear, points, cameras, damping = system[:5]
     split = eliminate_replicas(layout, linear, damping, partition, options)
-    right = split_right_hand_side(layout, linear, system, split)
-    step = solve_clusters(layout, linear, points._replace(projected=split[0]), system, right, partition)
-    return richardson(layout, linear, points, system, step, repairs)
+    right = split_right_hand_side(layout, linear, cameras, split)
+    parts = system._replace(points=points._replace(projected=split[0]))
+    return richardson(system, solve_clusters(parts, right, partition), repairs)
 
 
 def eliminate_replicas(
@@ -160,27 +149,19 @@ def split_right_hand_side(
 
 
 def solve_clusters(
-    layout: Layout,
-    linear: Linearization,
-    points: PointSystem,
-    system: CameraSystem,
-    right: Float[Array, "cameras width"],
-    partition: Partition,
+    system: DampedSystem, right: Float[Array, "cameras width"], partition: Partition
 ) -> Float[Array, "cameras width"]:
     """Solves the block-diagonal system, one dense factorisation per cluster.
 
     Args:
-        layout: the problem's observations, with pairs.
-        linear: residuals and Jacobians.
-        points: only `projected` is used; it couples the cameras of a cluster.
-        system: damped camera blocks.
+        system: damped camera blocks; of its points only `projected` is used, which couples the cameras of a cluster.
         right: right-hand side.
         partition: the clusters.
 
     Returns:
         The camera step, in manifold coordinates; non-finite for a cluster whose factorisation failed.
     """
-    matrices = cluster_matrices(layout, linear, points, system, partition)
+    matrices = cluster_matrices(system, partition)
     padded = jnp.concatenate([right, jnp.zeros((1, right.shape[1]), right.dtype)])
     rights = take_rows(padded, partition.members).reshape(partition.members.shape[0], -1)
     # large systems are solved one by one on a CPU, where each factorisation uses all cores
@@ -193,24 +174,20 @@ def solve_clusters(
     return jnp.zeros_like(padded).at[partition.members].set(steps)[:-1]
 
 
-def cluster_matrices(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, partition: Partition
-) -> Float[Array, "clusters n n"]:
+def cluster_matrices(system: DampedSystem, partition: Partition) -> Float[Array, "clusters n n"]:
     """The diagonal block of each cluster in the split system; only its lower triangle is filled."""
-    blocks = reduced_blocks(layout, linear, points, system)
+    blocks = reduced_blocks(system)
     blocks = jnp.concatenate([blocks, jnp.eye(blocks.shape[-1], dtype=blocks.dtype)[None]])
     clusters, size = partition.members.shape
     table = take_rows(blocks, partition.blocks)
     return table.transpose(0, 1, 3, 2, 4).reshape(clusters, size * blocks.shape[-1], -1)
 
 
-def richardson(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, step: Array, rounds: int
-) -> Float[Array, "cameras width"]:
+def richardson(system: DampedSystem, step: Array, rounds: int) -> Float[Array, "cameras width"]:
     """Richardson iterations `x <- x + B^-1 (b - S x)` on the true reduced camera system.
 
     They converge: each multiplies the error by `B^-1 E C^-1 E^T` (damped B and C), whose spectral radius is below one.
     """
-    inverse = block_inverse(computed_after(step, system.blocks))
-    iteration = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
+    inverse = block_inverse(computed_after(step, system.cameras.blocks))
+    iteration = lambda _, x: x + inverse(system.cameras.right - apply_reduced(system, x))
     return loops.fori_loop(0, rounds, iteration, step)

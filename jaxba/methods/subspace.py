@@ -24,8 +24,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.cholesky import solve_positive
-from jaxba.linear.schur import apply_reduced
-from jaxba.lm.method import DampedSystem, StepMethod
+from jaxba.linear.schur import DampedSystem, apply_reduced
+from jaxba.lm.method import StepMethod
 from jaxba.problem.options import StepOptions
 from jaxba.rotations import left_jacobian
 
@@ -58,7 +58,7 @@ def best_in_span(system: DampedSystem, step: Float[Array, "cameras width"]) -> F
         A camera step in manifold coordinates.
     """
     changes = jnp.asarray(system.layout.unknowns.restricted(system.state))
-    product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
+    product = lambda x: apply_reduced(system, x)
     return with_previous(product, system.cameras.right, step, on_manifold(system.parameters[0], changes))
 
 

@@ -135,15 +135,11 @@ def project(
     return Projection(pixel, [u, v], inverse, radius, distortion, rotated, local, turned, mask)
 
 
-class Derivatives(NamedTuple):
-    """Derivatives of the pixel by the camera (rotation on the manifold, translation, f, k1, k2) and by the point."""
-
-    camera: list[list[Array]]  # [2][9] of [n]
-    point: list[list[Array]]  # [2][3] of [n]
-
-
-def derivatives(frame: Frames, projection: Projection, columns: Sequence[int] | None = None) -> Derivatives:
-    """Jacobians of `project`, as lists of columns, each of which is one fused expression.
+def derivatives(
+    frame: Frames, projection: Projection, columns: Sequence[int] | None = None
+) -> tuple[list[list[Array]], list[list[Array]]]:
+    """Jacobians of `project` by the camera (rotation on the manifold, translation, lens), [2][width] of [n], and by the
+    point, [2][3] of [n]: columns, each of which is one fused expression.
 
     Args:
         frame: camera of each column.
@@ -164,7 +160,7 @@ def derivatives(frame: Frames, projection: Projection, columns: Sequence[int] | 
     camera = [[*_by_rotation(row, projection.rotated), *row, *own] for row, own in zip(rows, numbers, strict=True)]
     rotation = frame.rotation
     point = [[a * rotation[0][k] + b * rotation[1][k] + c * rotation[2][k] for k in range(3)] for a, b, c in rows]
-    return Derivatives(camera, point)
+    return camera, point
 
 
 def _by_rotation(row: list[Array], rotated: Float[Array, "3 ..."] | list[Array]) -> list[Array]:

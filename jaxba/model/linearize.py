@@ -45,15 +45,8 @@ class Linearization(NamedTuple):
     residual: list[Array]  # [2] of (slots,), pixels
     camera_jacobian: list[list[Array]]  # [2][width] of (slots,)
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
-    costs: Array  # (slots,), pixels squared
-    inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
+    reference: Reference  # the part of it that does not need derivatives
     priors: tuple[PriorTerms, ...]  # of cameras alone, if there are priors
-    prior_costs: tuple[Array, ...]  # (cameras,)
-
-    @property
-    def reference(self) -> Reference:
-        """The part of it that does not need derivatives."""
-        return Reference(self.costs, self.inverse_depth, self.prior_costs)
 
 
 @traced_once()
@@ -105,7 +98,7 @@ def point_terms(views: Views, loss: Loss) -> list[Array]:
     """
     projection = views.projected()
     residual = view_residuals(views, projection)
-    by_point = _whiten_columns(views, camera.derivatives(views.frames, projection, ()).point)
+    by_point = _whiten_columns(views, camera.derivatives(views.frames, projection, ())[1])
     rows = views.materialized([*by_point[0], *by_point[1], *residual])
     residual = rows[6:]
     entries = normal_entries([rows[:3], rows[3:6]], residual)
@@ -133,7 +126,7 @@ def linearize(
         projection = views.projected()
         residual = view_residuals(views, projection)
         jacobians = camera.derivatives(views.frames, projection, unknowns.columns)
-        by_camera, by_point = _whiten_columns(views, jacobians.camera), _whiten_columns(views, jacobians.point)
+        by_camera, by_point = (_whiten_columns(views, rows) for rows in jacobians)
         costs = slot_costs(loss, residual)
         rows = [*residual, *by_camera[0], *by_camera[1], *by_point[0], *by_point[1]]
         if not loss.trivial:
@@ -145,8 +138,8 @@ def linearize(
     residual, rows = rows[:2], rows[2:]
     width = (len(rows) - 6) // 2
     by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
-    priors = prior_terms(unknowns, cameras)
-    return Linearization(residual, by_camera, by_point, costs, inverse_depth, priors, prior_costs(layout, cameras))
+    reference = Reference(costs, inverse_depth, prior_costs(layout, cameras))
+    return Linearization(residual, by_camera, by_point, reference, prior_terms(unknowns, cameras))
 
 
 def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:

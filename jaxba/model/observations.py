@@ -71,10 +71,6 @@ def _views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 points
 def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
     """`view_terms` summed over the observations of each point, as a function of the points.
 
-    Args:
-        layout: the problem's observations.
-        frames: camera of every slot, materialised.
-
     Returns:
         A function of points, `Terms` and further vectors over slots, which returns a vector over points for each term.
     """

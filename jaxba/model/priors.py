@@ -7,8 +7,6 @@ translation, numbers of the lens.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,12 +19,8 @@ from jaxba.problem.priors import Priors
 from jaxba.rotations import compose_left, rotation_matrix
 from jaxba.structure.unknowns import Unknowns
 
-
-class PriorTerms(NamedTuple):
-    """Normal equations of the priors, as those of `CameraSystem`."""
-
-    blocks: Float[Array, "cameras width width"]
-    gradient: Float[Array, "cameras width"]
+PriorTerms = tuple[Float[Array, "cameras width width"], Float[Array, "cameras width"]]
+"""Blocks and gradient that priors add to the normal equations of each camera, as those of `CameraSystem`."""
 
 
 def costs_of(
@@ -70,7 +64,7 @@ def _terms(
         rows = jnp.stack([column[part] for column in columns]) * free[:, None]  # [width, residuals, cameras]
         blocks = blocks + jnp.einsum("arc,brc,c->cab", rows, rows, scale, precision="highest")
         gradient = gradient + jnp.einsum("arc,rc,c->ca", rows, residual[part], scale, precision="highest")
-    return PriorTerms(jnp.asarray(blocks), jnp.asarray(gradient))
+    return jnp.asarray(blocks), jnp.asarray(gradient)
 
 
 def _residuals(priors: Priors, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"]) -> tuple[Array, Array]:

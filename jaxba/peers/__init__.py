@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from jaxba.solver.names import SolverName, SolverNameError
+from jaxba.solver.names import SolverName
+from jaxba.typing import InputError
 
 NEEDS = {"pyceres": ("ceres", ("pyceres", "pycolmap"))}
 """For each library: the extra of jaxba that installs it, and the packages of that extra."""
@@ -15,11 +16,11 @@ def require(solver: SolverName) -> None:
     """Checks that the library of a solver is installed.
 
     Raises:
-        SolverNameError: it is not; the message names the package to install.
+        InputError: it is not; the message names the package to install.
     """
     if not solver.peer:
         return
     extra, packages = NEEDS[solver.peer.partition(":")[0]]
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
-        raise SolverNameError(f"{str(solver)!r} needs {' and '.join(missing)}: pip install jaxba[{extra}]")
+        raise InputError(f"{str(solver)!r} needs {' and '.join(missing)}: pip install jaxba[{extra}]")

@@ -144,7 +144,7 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
     fields: dict[str, Any] = dict.fromkeys(StepInfo._fields, np.nan)
     fields |= {"cost": cost, "previous_cost": cost, "damping": damping, "forcing": 0.0, "step_fraction": 1.0}
     fields |= dict.fromkeys(("accepted", "weightless"), False)
-    fields |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), 0)
+    fields |= dict.fromkeys(("cg_iterations", "repairs"), 0)
     return StepInfo(**{**fields, **known})
 
 

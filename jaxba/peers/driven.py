@@ -25,7 +25,6 @@ from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.linear.schur import jacobian_product
-from jaxba.linear.step import Step
 from jaxba.lm.records import KINDS, LMState, StepInfo
 from jaxba.lm.step import Proposal, initial_state, try_step
 from jaxba.lm.termination import Termination, Tolerances
@@ -35,6 +34,7 @@ from jaxba.peers.colmap import pyceres
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.refinement.acceptance import Step
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
@@ -42,7 +42,7 @@ from jaxba.solver.iteration import Carry, advance, begin
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.place import Placed
 from jaxba.solver.solve import Solution
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 """Limits of the radius, so wide that they do not change the lambda of any policy."""
@@ -178,7 +178,7 @@ def drive_ceres(
         started = time.perf_counter()
         carry = _begin(_problem_info(problem, run.initial_cost, max_iterations), policy, None)
         # everything is compiled before the clock starts
-        layout = jax.device_put(layout_for(colmap.start, own))
+        layout = jax.device_put(build_layout(colmap.start, own))
         state = initial_state(layout, colmap.start, own)
         null_step = _null_step(run.cost, float(carry.damping))
         tried(colmap.parameters(), float(carry.damping), null_step)

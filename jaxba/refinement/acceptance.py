@@ -19,7 +19,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Step
 from jaxba.model.linearize import Reference, observation_costs, prior_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide
@@ -49,80 +48,54 @@ COST_ROUNDING = 8.0
 problems, and 2e-15 in float64."""
 
 
-class Work(NamedTuple):
-    """What the search for the candidate of a step took."""
+class Step(NamedTuple):
+    """A damped step d and the terms of its linear model (lm/damped_step.py)."""
 
-    repairs: Int[Array, ""]
-    """Camera rounds, trials and pattern moves after the first candidate."""
+    cameras: Float[Array, "parameters cameras"]  # in the coordinates of the options
+    points: Float[Array, "3 points"]
+    slope: Float[Array, ""]  # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2
+    damped: Float[Array, ""]  # -g.d - d.H d, which is d.D d if the step solves the damped system; pixels^2
+    gradient_max: Float[Array, ""]  # largest absolute gradient entry before the step
+    cg_iterations: Int[Array, ""]  # 0 when the system was factored
+    forcing: Float[Array, ""]  # forcing term that stopped them; 0 for an exact solve
 
-    camera_rounds: Int[Array, ""]
-    """The camera rounds among them."""
+    def predicted(self, fraction: Float[Array, ""]) -> Float[Array, ""]:
+        """Decrease of the cost that the linear model predicts for `fraction * d`, pixels^2.
 
-    point_iterations: Int[Array, ""]
-    """Embedded point iterations of all candidates, as many as each might make."""
+        `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not negative, so that
+        nothing cancels.
+        """
+        return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
 
 
 class Candidate(NamedTuple):
     """Proposed parameters, with the accept decision."""
 
     cameras: Float[Array, "parameters cameras"]
-    """Proposed cameras."""
-
-    points: Float[Array, "3 points"]
-    """Proposed points, scene units."""
-
-    cost: Float[Array, ""]
-    """Their cost, pixels^2."""
-
-    predicted: Float[Array, ""]
-    """Decrease that the linear model predicts for this step fraction, pixels^2."""
-
-    gain: Float[Array, ""]
-    """Actual over predicted decrease."""
-
+    points: Float[Array, "3 points"]  # scene units
+    cost: Float[Array, ""]  # pixels^2
+    predicted: Float[Array, ""]  # decrease that the linear model predicts for this step fraction, pixels^2
+    gain: Float[Array, ""]  # actual over predicted decrease
     accepted: Bool[Array, ""]
-    """The accept decision."""
-
-    step_fraction: Float[Array, ""]
-    """Length relative to the full step."""
-
-    work: Work
-    """What the search for it took so far."""
+    step_fraction: Float[Array, ""]  # length relative to the full step
+    repairs: Int[Array, ""]  # camera rounds, trials and pattern moves after the first candidate
 
 
 class Comparison(NamedTuple):
     """The data of one step with which its candidates are evaluated."""
 
     layout: Layout
-    """The problem's observations."""
-
-    cameras: Float[Array, "parameters cameras"]
-    """Cameras before the step."""
-
-    cost: Float[Array, ""]
-    """Cost before the step, pixels^2."""
-
+    cameras: Float[Array, "parameters cameras"]  # before the step
+    cost: Float[Array, ""]  # before the step, pixels^2
+    # terms of that cost, of points if points are refined, else of slots; differences are summed, since the difference
+    # of sums cancels in float32
     terms: Float[Array, " terms"]
-    """Terms of that cost, of points if points are refined, else of slots. Differences are summed, since the difference
-    of sums cancels in float32."""
-
-    previous: PreviousPoints
-    """Points before the step; diverged ones return there."""
-
-    step: Step
-    """The full step."""
-
+    previous: PreviousPoints  # before the step; diverged points return there
+    step: Step  # the full step
     options: StepOptions
-    """Options of the step."""
-
-    min_gain: float | Float[Array, ""]
-    """Gain ratio that an accepted candidate must exceed."""
-
-    starts: Int[Array, ""]
-    """Starts of points after the full step (`midpoints.refine_from_starts`)."""
-
-    matters: Bool[Array, ""]
-    """Whether the predicted decrease is worth camera rounds and further trials."""
+    min_gain: float | Float[Array, ""]  # gain ratio that an accepted candidate must exceed
+    starts: Int[Array, ""]  # starts of points after the full step (`midpoints.refine_from_starts`)
+    matters: Bool[Array, ""]  # whether the predicted decrease is worth camera rounds and further trials
 
 
 def comparison(
@@ -135,18 +108,7 @@ def comparison(
     options: StepOptions,
     min_gain: float | Float[Array, ""],
 ) -> Comparison:
-    """The `Comparison` of a step.
-
-    Args:
-        layout: the problem's observations.
-        cameras: current cameras.
-        points: current points.
-        cost: their cost, pixels^2.
-        reference: costs and depths of the slots at the current parameters.
-        step: solution of the damped system.
-        options: static options of the step.
-        min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
-    """
+    """The `Comparison` of a step from current cameras and points, whose cost, costs of slots and depths are known."""
     predicted = step.predicted(jnp.ones_like(cost))
     matters = predicted > NEGLIGIBLE * cost
     previous = PreviousPoints.of(layout, points, reference)
@@ -170,7 +132,7 @@ def assess(
     cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     step_fraction: Float[Array, ""],
-    work: Work,
+    repairs: Int[Array, ""],
     full_step: Bool[Array, ""],
 ) -> Candidate:
     """Refines the points of a candidate and decides whether it is accepted.
@@ -180,12 +142,11 @@ def assess(
         cameras: cameras of the candidate.
         points: points before their embedded iterations.
         step_fraction: it scales the predicted decrease.
-        work: what the search took so far, without the point iterations of this candidate.
+        repairs: camera rounds, trials and pattern moves until then, with this one.
         full_step: whether this is the full step, after which points may also start from their rays.
     """
     layout = against.layout
     predicted = against.step.predicted(step_fraction)
-    work = work._replace(point_iterations=(work.point_iterations + against.options.refinement.points).astype(jnp.int32))
     points, terms = _refined(against, cameras, points, predicted, full_step)
     cost, decrease = (sum_over_devices(layout, total(each)) for each in (terms, against.terms - terms))
     gain = safe_divide(decrease, predicted)
@@ -194,7 +155,7 @@ def assess(
     rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
     accepted = accepted & ((predicted > rounding) | (decrease > COST_ROUNDING * rounding))
     accepted = accepted & jnp.isfinite(cost) & jnp.all(keep_focal_signs(against.cameras, cameras))
-    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, work)
+    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, repairs)
 
 
 def _refined(

@@ -14,7 +14,6 @@ from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOption
 from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_unfused
-from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
@@ -28,12 +27,6 @@ def refine_cameras(
 ) -> Float[Array, "parameters cameras"]:
     """One damped Gauss-Newton step of every camera on its own, accepted if that camera's own cost falls.
 
-    Args:
-        layout: the problem's observations.
-        cameras: current cameras.
-        points: points, held fixed.
-        options: the loss, and whether intrinsics are fixed.
-
     Returns:
         New cameras; the total cost is never larger than before.
     """
@@ -46,8 +39,8 @@ def refine_cameras(
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient = products[:, :, :width], products[:, :, width]
     unknowns = layout.unknowns
-    for terms in prior_terms(unknowns, cameras, alone=True):
-        blocks, gradient = blocks + terms.blocks, gradient + terms.gradient
+    for own, slope in prior_terms(unknowns, cameras, alone=True):
+        blocks, gradient = blocks + own, gradient + slope
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
@@ -56,12 +49,12 @@ def refine_cameras(
     def whole_cost(costs: Array, cameras: Array) -> Array:
         return sum((costs_of(priors, unknowns, cameras) for priors in unknowns.priors), own_cost(costs))
 
-    before = whole_cost(linear.costs, cameras)
+    before = whole_cost(linear.reference.costs, cameras)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         best, done, attempt_number = carry
         damped = blocks + (dampings[attempt_number] * diagonal)[:, :, None] * jnp.eye(width, dtype=blocks.dtype)
-        step = -components_first(solve_positive(damped, gradient))
+        step = -solve_positive(damped, gradient).T
         # the Jacobian, and so the step, is in manifold coordinates
         trial = camera.moved(cameras, unknowns.expanded(step), unknowns)
         costs = observation_costs(layout, trial, points, options.loss)

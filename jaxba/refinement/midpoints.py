@@ -7,7 +7,6 @@ solves `sum (I - u u^T) X = sum (I - u u^T) c`.
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -68,28 +67,17 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     return [jnp.where(views.mask, row, jnp.zeros_like(row)) for row in [*matrix, *right]]
 
 
-class Starts(NamedTuple):
-    """Two starts for every point."""
-
-    likely: Float[Array, "3 points"]  # the one with the lower cost, or the only one that has not diverged
-    other: Float[Array, "3 points"]  # the other one, or the same if there is none
-
-
 def choose_starts(
     layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], loss: Loss, previous: PreviousPoints
-) -> Starts:
-    """The positions of points after the step and the midpoints of their rays, ordered by how likely they are.
+) -> Float[Array, "2 3 points"]:
+    """Two starts for every point: its position after the step and the midpoint of its rays.
+
+    First the one with the lower cost, or the only one that has not diverged; then the other one, or the same if there
+    is none.
 
     If the linear model sends a point behind its cameras, or so far away that its gradient vanishes, small steps of its
     own do not bring it back; the midpoint of its rays does. A midpoint that has diverged itself (`PreviousPoints`) is
     not used.
-
-    Args:
-        layout: the problem's observations.
-        frames: camera of every slot after the step.
-        points: points after the step.
-        loss: robust loss.
-        previous: points before the step.
     """
     middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
 
@@ -109,7 +97,7 @@ def choose_starts(
     possible = (lost == 0) & ~has_receded(other_inverse_depth, previous.inverse_depth_sum) & jnp.isfinite(costs)
     possible = layout.unknowns.free_points.where(possible, False)
     better = possible & ((costs < own) | diverged)
-    return Starts(jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points))
+    return jnp.stack([jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points)])
 
 
 def refine_from_starts(
@@ -139,7 +127,7 @@ def refine_from_starts(
     Returns:
         As `refine_points`.
     """
-    choose = lambda frames, points, previous: jnp.stack(choose_starts(layout, frames, points, loss, previous))
+    choose = lambda frames, points, previous: choose_starts(layout, frames, points, loss, previous)
     candidates = loops.run_if(starts > 0, choose, (frames, points, previous), jnp.stack([points, points]))
 
     def refine_start(number: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:

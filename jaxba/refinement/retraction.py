@@ -34,14 +34,7 @@ def move_cameras(
     step: Float[Array, "parameters cameras"],
     options: StepOptions,
 ) -> Float[Array, "parameters cameras"]:
-    """Adds a step to cameras, in the coordinates of the options.
-
-    Args:
-        layout: knows which intrinsics are constant, and the camera models.
-        cameras: current cameras.
-        step: camera step in the coordinates of the options.
-        options: `Coordinates.rotation` and `lens_step`, and `intrinsics`.
-    """
+    """Adds a step to cameras, in the coordinates of the options."""
     unknowns = layout.unknowns
     on_manifold = options.coordinates.rotation == "manifold"
     moved = camera.moved(cameras, step, unknowns) if on_manifold else cameras + step

@@ -38,7 +38,7 @@ from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.place import check_problem, placed
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 from jaxba.typing import ArrayRecord
 
 UNDETERMINED = 1e-9
@@ -136,7 +136,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
         hint = "fix them with a gauge, constants or priors"
         raise ProblemError(f"{which} not determined by what is observed; {hint}")
     with numerics(np.float64):
-        layout = layout_for(problem, options)
+        layout = build_layout(problem, options)
         linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))
     index, count = _unknown_index(problem, layout)
     free_points = np.ones(problem.num_points, bool)
@@ -271,8 +271,8 @@ def _system(
     used = place >= 0
     at = np.repeat(rows, index.shape[1])
     parts, height = [csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))], len(rows)
-    for priors in linear.priors:
-        parts, height = [*parts, _prior_rows(index, count, np.asarray(priors.blocks))], height + index.size
+    for blocks, _ in linear.priors:
+        parts, height = [*parts, _prior_rows(index, count, np.asarray(blocks))], height + index.size
     place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
     seen, starts = np.bincount(point, minlength=points) > 0, np.searchsorted(point, np.arange(points + 1))
     by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (height, 3 * points))

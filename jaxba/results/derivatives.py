@@ -31,15 +31,7 @@ from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy
 from jaxba.linear.reduced_system import solve_reduced
-from jaxba.linear.schur import (
-    PointSystem,
-    RotationCoordinates,
-    back_substitute,
-    camera_system,
-    eliminate_points,
-    lift_to_cameras,
-)
-from jaxba.linear.two_level import Anchor
+from jaxba.linear.schur import DampedSystem, back_substitute, lift_to_cameras
 from jaxba.lm.step import initial_state
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
@@ -305,17 +297,13 @@ def _gauss_newton(
     """`(J^T J + D)^-1` by the Schur complement, as a function of a right-hand side of cameras and points."""
     linear = only_free(layout, linearize(layout, cameras, points, options.loss), options.intrinsics)
     damping = jnp.asarray(DAMPING, cameras.dtype)
-    coordinates = RotationCoordinates.of(cameras, options)
-    eliminated = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, eliminated, coordinates, damping, options)
-    anchor = Anchor(rotation_matrix(cameras[:3]), cameras[3:6], points)
+    system = DampedSystem.of(layout, linear, cameras, points, damping, options)
 
     def inverse(right: tuple[Array, Array]) -> tuple[Array, Array]:
-        by_points: PointSystem = eliminated._replace(solved=[-x for x in eliminated.factor.forward(list(right[1]))])
-        lifted = lift_to_cameras(layout, linear, by_points)
-        solved, _ = solve_reduced(
-            layout, linear, by_points, system._replace(right=right[0] + lifted), anchor, options, 0.0
-        )
-        return solved, jnp.stack(back_substitute(layout, linear, by_points, solved))
+        solved = [-x for x in system.points.factor.forward(list(right[1]))]
+        own = system._replace(points=system.points._replace(solved=solved))
+        own = own._replace(cameras=own.cameras._replace(right=right[0] + lift_to_cameras(own)))
+        step, _ = solve_reduced(own, options)
+        return step, jnp.stack(back_substitute(own, step))
 
     return inverse

@@ -34,8 +34,7 @@ from jaxba.runtime.compilation import program, quick_runs
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.place import check_problem, placed
-from jaxba.structure.conventions import components_first, items_first
-from jaxba.structure.layout import Layout, build_layout
+from jaxba.structure.layout import NO_SYSTEM, Layout, build_layout
 from jaxba.typing import ArrayRecord
 
 START_DISTANCES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
@@ -106,13 +105,13 @@ def retriangulate_without(
     """`retriangulate` where it is known which images face away."""
     with numerics(np.float64):
         counted, offset, here = placed(problem, away)
-        layout = build_layout(here, pairs=False, grid=False)
+        layout = build_layout(here, NO_SYSTEM)
         order, real = layout.points, layout.points < problem.num_points  # without padding points
         first = np.zeros(problem.num_points, np.int64)
         first[here.point_index[::-1]] = here.camera_index[::-1]  # the first observation is written last and stays
         origin = np.zeros((3, len(order)))
         centers = geometry.camera_centers(counted.cameras) - offset
-        origin[:, real] = components_first(centers[first[order[real]]])
+        origin[:, real] = centers[first[order[real]]].T
         level = "quick" if quick_runs("acceptance", here.num_observations) > EQUIVALENT_STEPS else "full"
         search = program(_search, "loss", level=level)
         arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
@@ -121,7 +120,7 @@ def retriangulate_without(
     if not np.isfinite(before):
         raise ProblemError(explain_start(problem, loss))
     points, moved = np.array(problem.points, np.float64), np.asarray(moved) & real
-    points[order[moved]] = items_first(np.asarray(found))[moved] + offset
+    points[order[moved]] = np.asarray(found).T[moved] + offset
     return Retriangulation(problem.replace(points=points), int(moved.sum()), float(before), float(after))
 
 

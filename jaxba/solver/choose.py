@@ -1,33 +1,83 @@
-"""Choice of the linear solver, and refusal of what a method does not support or a machine cannot hold."""
+"""Choice of the linear solver, and refusal of what a method does not support or a machine cannot hold.
+
+The predicted time of an iteration is a sum of amounts of work (observations, pairs, cubes of unknowns, ...) times
+measured seconds per unit. Only ratios matter for the choice, and they differ little between machines.
+"""
 
 from __future__ import annotations
 
 import os
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxba.lm.method import check_plain
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
-from jaxba.solver.cost_model import (
-    BYTES_PER_OBSERVATION,
-    INEXACT_ITERATIONS,
-    factoring_bytes,
-    most_bytes,
-    predict,
-)
+from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.structure.camera_ordering import camera_order, is_banded
+from jaxba.structure.density import has_small_capacitance, is_dense
 from jaxba.structure.observation_order import ObservationOrder
 
+Work = dict[str, Any]
+"""Amounts of work of an iteration, by the keys of `SECONDS`."""
 
-def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
-    """The linear solver with the lowest predicted time to convergence. Arguments as for `work`."""
-    times = {
-        name: time if name == "explicit" else INEXACT_ITERATIONS * time
-        for name, time in predict(problem, observations)._asdict().items()
-    }
-    return min(times, key=lambda name: times[name])  # type: ignore[return-value]
+SECONDS: Work = {
+    "step": 1.8e-4,  # constant cost of an iteration
+    "observation": 1.7e-7,  # observations that are linearised, eliminated and evaluated
+    "pair": 2.0e-8,  # forming the blocks: pairs of observations of one point
+    "dense_product": 2.7e-11,  # forming the system as one dense product (structure/density.py): multiply-add operations
+    "square": 4.8e-9,  # dense factorisation, memory traffic and single-core part: unknowns squared
+    "cube": 2.7e-12,  # dense factorisation: unknowns cubed
+    "band": 4.2e-11,  # band factorisation: unknowns times the square of the unknowns of the bandwidth
+    "block": 1.1e-7,  # products of conjugate gradients with formed blocks: blocks
+    "implicit": 1.7e-8,  # products of conjugate gradients without forming the system: observations
+    "coarse": 6.6e-8,  # forming the coarse system of the two-level preconditioner: observations
+}
+"""Seconds per unit of each kind of work. Fitted to steps with three point iterations in float64 on two cores of an
+x86-64 processor with AVX-512: `python -m benchmarks.choice --fit`."""
+
+ASSUMED_PRODUCTS = 12
+"""Assumed conjugate gradient iterations of a step with the two-level preconditioner. Measured: 6 to 20 on real
+problems."""
+
+INEXACT_ITERATIONS = 1.2
+"""Iterations to convergence with truncated conjugate gradients, relative to a factorisation. Measured: geometric mean
+over bulani1, bulani2, bulani4 and the policies ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
+
+DENSE_MATRICES = 4
+"""Matrices of that size in memory for a dense factorisation: the system, a copy of its blocks, its transpose, its
+factor."""
+
+MAX_BYTES = 4e9
+"""Largest memory of a solver that `auto` may choose."""
+
+BYTES_PER_OBSERVATION = 1100.0
+"""Device memory of one implicit step in float64: arguments, results and temporaries; half of it in float32. Measured:
+1,072 on a scene of the size of Ladybug-1197."""
+
+BYTES_PER_PAIR = 16.0
+"""Index arrays with padding; the products are computed in batches."""
+
+MATRICES_PER_BLOCK = 3
+"""Numbers in memory per number of a block: its own, its partial sums and its sum."""
+
+MAX_COUNTED_PAIRS = 20_000_000
+"""Most pairs for which blocks are counted, which takes less than a second."""
+
+MAX_COUNTED_CAMERAS = 20_000
+"""Most cameras for which blocks are counted: the table takes a byte per pair of cameras."""
+
+
+class PairCounts(NamedTuple):
+    """Numbers that determine the size of the reduced camera system."""
+
+    pairs: int  # pairs of observations of one point, an observation with itself included
+    blocks: int  # pairs of cameras with common points, a camera with itself included
+    bandwidth: int  # largest distance of two such cameras in the better ordering
 
 
 def choose_linear_solver(
@@ -50,24 +100,122 @@ def choose_linear_solver(
         ProblemError: a method is asked for that does not support the problem; or a step needs more memory than the
             device or the machine has.
     """
-    _check_device_memory(problem, devices)
+    _check_device_memory(len(problem.observations), devices)
+    lenses, rigs = problem.lenses, problem.rigs
     if options.method:
-        lenses = problem.lenses
         shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
         check_plain(
             options,
             ProblemError,
-            rigs=problem.rigs is not None,
+            rigs=rigs is not None,
             shared_lenses=bool(shared) and options.intrinsics == "free",
             priors=problem.priors is not None,
         )
         return options
-    observations = observations or ObservationOrder.of(problem)
     if asked == "auto":
-        return replace(options, linear_solver=choose(problem, observations))  # `choose` respects MAX_BYTES
+        return replace(options, linear_solver=choose(problem, observations))
     if asked == "explicit":
-        _check_memory(problem, observations)
+        _check_memory(observations or ObservationOrder.of(problem), _width(problem), rigs is not None)
     return replace(options, linear_solver=asked)
+
+
+def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
+    """The linear solver with the lowest predicted time to convergence. Arguments as for `work`."""
+    times = {
+        name: time if name == "explicit" else INEXACT_ITERATIONS * time
+        for name, time in predict(problem, observations).items()
+    }
+    return min(times, key=lambda name: times[name])  # type: ignore[return-value]
+
+
+def predict(problem: BundleProblem, observations: ObservationOrder | None = None) -> dict[str, float]:
+    """Predicted seconds of one iteration with each linear solver, infinite if it needs more than `MAX_BYTES`.
+    Arguments as for `work`."""
+    amounts = work(problem, observations=observations)
+    return {n: seconds(amounts[n]) if n in amounts else np.inf for n in ("explicit", "sparse", "implicit")}
+
+
+def seconds(amounts: Work) -> float:
+    """Predicted time of amounts of work."""
+    return sum(amount * SECONDS[kind] for kind, amount in amounts.items())
+
+
+def work(
+    problem: BundleProblem, products: float = ASSUMED_PRODUCTS, observations: ObservationOrder | None = None
+) -> dict[str, Work]:
+    """Work of one iteration with each linear solver that needs at most `MAX_BYTES`.
+
+    Args:
+        problem: determines the numbers of cameras, observations, pairs and co-visible blocks.
+        products: number of products of conjugate gradients in a step.
+        observations: the sorted observations of the problem, if they are known already.
+    """
+    order, width = observations or ObservationOrder.of(problem), _width(problem)
+    counts, observed = count_pairs(order), len(order.order)
+    every = {"step": 1.0, "observation": observed}
+    solvers = {"implicit": every | {"coarse": observed, "implicit": products * observed}}
+    if _bytes_of_blocks(counts, width) <= MAX_BYTES:
+        solvers["sparse"] = every | {"coarse": observed, "block": products * counts.blocks, "pair": counts.pairs}
+    factoring, needed = _factoring(order, counts, width, problem.rigs is not None)
+    if needed <= MAX_BYTES:
+        solvers["explicit"] = every | factoring
+    return solvers
+
+
+def count_pairs(observations: ObservationOrder) -> PairCounts:
+    """Counts pairs and blocks. Blocks and bandwidth are upper bounds for more than `MAX_COUNTED_PAIRS` pairs."""
+    pairs, cameras, tracks = observations.num_pairs, observations.num_cameras, observations.tracks
+    if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
+        return _most_pairs(observations)
+    camera, start = observations.camera, observations.start[:-1]
+    shared = np.zeros((cameras, cameras), bool)
+    for length in np.unique(tracks[tracks > 0]):
+        first = start[tracks == length][:, None]
+        row, column = np.tril_indices(length)
+        shared[camera[first + row], camera[first + column]] = True
+    rows, columns = np.nonzero(shared)
+    return PairCounts(pairs, len(rows), camera_order(rows, columns, cameras)[1])
+
+
+def _most_pairs(observations: ObservationOrder) -> PairCounts:
+    """Upper bounds of blocks and bandwidth."""
+    pairs, cameras = observations.num_pairs, observations.num_cameras
+    return PairCounts(pairs, min(pairs, cameras * (cameras + 1) // 2), cameras)
+
+
+def _factoring(observations: ObservationOrder, counts: PairCounts, width: int, rigs: bool) -> tuple[Work, float]:
+    """Work of forming and factoring the system, and the memory that it needs, bytes.
+
+    Args:
+        observations: sorted observations of the problem.
+        counts: pairs and blocks.
+        width: unknowns of a camera.
+        rigs: whether cameras move together, so that the system is dense.
+    """
+    unknowns, band = float(width * observations.num_cameras), float(width * counts.bandwidth)
+    points, cameras = observations.num_observed_points, observations.num_cameras
+    if is_dense(observations, cameras, points + 1):
+        side, inner = unknowns, 3.0 * points
+        if has_small_capacitance(points + 1, cameras):
+            side, inner = 3.0 * (points + 1), unknowns
+        return {"dense_product": side**2 * inner, "square": side**2, "cube": side**3}, 3 * 8 * side * inner
+    forming, blocks = {"pair": counts.pairs}, _bytes_of_blocks(counts, width)
+    if not rigs and is_banded(cameras, counts.bandwidth):
+        return forming | {"band": unknowns * band**2}, blocks + 3 * 8 * unknowns * band
+    return forming | {"square": unknowns**2, "cube": unknowns**3}, blocks + DENSE_MATRICES * 8 * unknowns**2
+
+
+def _bytes_of_blocks(counts: PairCounts, width: int) -> float:
+    """Memory of the blocks and of the index arrays that form them."""
+    return counts.pairs * BYTES_PER_PAIR + counts.blocks * MATRICES_PER_BLOCK * 8.0 * width**2
+
+
+def _width(problem: BundleProblem) -> int:
+    """Unknowns of a camera's block."""
+    lenses, rigs = problem.lenses, problem.rigs
+    extrinsics = 0 if rigs is None or rigs.free is None else EXTRINSICS_SIZE
+    own = CAMERA_SIZE if lenses is None else POSE_SIZE + int(np.asarray(lenses.free).any(axis=0).sum())
+    return own + extrinsics
 
 
 def device_memory() -> float:
@@ -77,29 +225,30 @@ def device_memory() -> float:
     return float(stats.get("bytes_limit", 0)) or np.inf
 
 
-def _check_device_memory(problem: BundleProblem, devices: int) -> None:
+def _check_device_memory(observations: int, devices: int) -> None:
     """Raises a `ProblemError` if the observations alone do not fit the memory of a GPU, whatever the linear solver."""
     available = device_memory()
-    needed = 0.5 * BYTES_PER_OBSERVATION * problem.num_observations / devices  # in float32
+    needed = 0.5 * BYTES_PER_OBSERVATION * observations / devices  # in float32
     if needed > available:
         raise ProblemError(
-            f"{problem.num_observations} observations take {2 * needed / 1e9:.1f} GB of a device in float64 and "
+            f"{observations} observations take {2 * needed / 1e9:.1f} GB of a device in float64 and "
             f"{needed / 1e9:.1f} in float32, more than its {available / 1e9:.1f} GB: "
             "divide them among more (--devices) or take the CPU (--device cpu)"
         )
 
 
-def _check_memory(problem: BundleProblem, observations: ObservationOrder) -> None:
+def _check_memory(observations: ObservationOrder, width: int, rigs: bool) -> None:
     """Raises a `ProblemError` if a factorisation needs more memory than the machine has."""
     try:
         available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return
-    needed = most_bytes(problem, observations)
+    most = _bytes_of_blocks(_most_pairs(observations), width)
+    needed = most + DENSE_MATRICES * 8.0 * (width * observations.num_cameras) ** 2
     if needed > available:  # an upper bound: count blocks and look for a band
-        needed = factoring_bytes(problem, observations)
+        needed = _factoring(observations, count_pairs(observations), width, rigs)[1]
     if needed > available:
         raise ProblemError(
-            f"{problem.num_cameras} cameras take some {needed / 1e9:.0f} GB to "
+            f"{observations.num_cameras} cameras take some {needed / 1e9:.0f} GB to "
             f"solve by a factorisation, more than the {available / 1e9:.0f} GB of this machine"
         )

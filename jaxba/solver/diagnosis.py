@@ -18,7 +18,7 @@ from jaxba.refinement.acceptance import COST_ROUNDING
 from jaxba.runtime.compilation import program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.place import placed
-from jaxba.structure.layout import Layout, build_layout
+from jaxba.structure.layout import NO_SYSTEM, Layout, build_layout
 
 
 def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any = np.float64) -> str:
@@ -35,7 +35,7 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     loss = loss or Loss()
     with numerics(dtype):
         here = placed(problem).here
-        layout = build_layout(here, pairs=False, grid=False)
+        layout = build_layout(here, NO_SYSTEM)
         found = program(_start_terms, "loss", "dtype", level="quick")(layout, here, loss, dtype)
         costs, inverse_depth = (np.asarray(x) for x in found)
     slots = np.flatnonzero(np.asarray(layout.slot_mask) & ~np.isfinite(costs))

@@ -1,20 +1,23 @@
-"""The loop that `solve` runs: iterations by a driver, with their records, the clock, and who looks at them."""
+"""Who runs the iterations of a solve, and what they show of each: one compiled program, on one device or several.
+
+The third way, from Python, is stepwise.py.
+"""
 
 from __future__ import annotations
 
-import functools
-import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
 
 from jaxba.lm.records import LMState, StepInfo
-from jaxba.lm.termination import Termination
+from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.driver import Compiled, OnDevices
-from jaxba.solver.options import SolveOptions
+from jaxba.runtime.compilation import CompileClock, Program
+from jaxba.solver.iteration import Carry, solve_loop
 from jaxba.solver.prepare import Setup
-from jaxba.solver.stepwise import Stepwise, quick_runs_of
+from jaxba.solver.sharded import Shards
 
 
 class IterationRecord(NamedTuple):
@@ -37,85 +40,71 @@ Watch = Callable[[IterationRecord, Callable[[], BundleProblem]], None]
 """Gets the record of an iteration, and a function that gives the problem with the parameters after it."""
 
 
-class Run(NamedTuple):
-    """What a solve came to."""
+MIN_LENGTH = 128
+"""Smallest length of the record of a compiled loop, so that all lower limits use one program; larger limits are
+rounded up to a power of two."""
 
-    state: LMState
-    """After the last iteration."""
 
-    steps: StepInfo
-    """Records of all iterations, NumPy arrays."""
+class Driver:
+    """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives the state at the
+    start, and `finish`, which runs all iterations as one program, or `iterate`, which runs one, or both."""
 
-    termination: Termination
-    """Why it ended."""
+    carry: Carry
+    """The state of the loop; from `begin`, or `finish`, on."""
 
-    initial_cost: float
-    """Pixels^2."""
-
-    quick_iterations: int
+    quick_iterations = 0
     """Iterations in which some program was not fully optimised."""
 
-    compile_s: float
-    """Seconds of compilation."""
+    def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
+        self.setup, self.tolerances, self.clock = setup, tolerances, clock
+        self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
+        self.length = max(MIN_LENGTH, 1 << int(self.limit - 1).bit_length())
 
-    total_s: float
-    """Seconds of the iterations."""
+    def compile_s(self) -> float:
+        """Seconds of compilation so far."""
+        return self.clock.seconds
 
-
-def run(setup: Setup, options: SolveOptions, callback: Callback | None, watch: Watch | None) -> Run:
-    """Runs iterations until a stopping rule or the callback ends the solve.
-
-    Args:
-        setup: the solve.
-        options: tolerances, limit and level of compilation.
-        callback: called with every record; a true return value ends the solve.
-        watch: called before the callback; its time counts nowhere.
-
-    Raises:
-        ProblemError: the cost of the initial state is not finite.
-    """
-    alone = callback is None and watch is None
-    callback, watch = callback or _go_on, watch or _look_away
-    with CompileClock() as clock:
-        driver = _driver(setup, options, clock, alone)
-        start = driver.begin()
-        setup.check_cost(start)
-        initial_cost, compiled, watched, began = float(start.cost), driver.compile_s(), 0.0, time.perf_counter()
-        elapsed = lambda: time.perf_counter() - began - watched - (driver.compile_s() - compiled)
-        steps, records = None, []
-        end = Termination.RUNNING if options.max_iterations else Termination.MAX_ITERATIONS
-        if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise):
-            steps, end = driver.finish()
-        while end == Termination.RUNNING and not isinstance(driver, Compiled):
-            step, end = driver.iterate()
-            records.append(step)
-            record = IterationRecord(len(records), elapsed(), step)
-            looked = time.perf_counter()
-            watch(record, functools.partial(setup.problem_at, driver.carry.state))
-            watched += time.perf_counter() - looked
-            if callback(record) and end == Termination.RUNNING:
-                end = Termination.STOPPED
-        total_s = elapsed()
-    state = driver.carry.state if options.max_iterations else start
-    steps = steps or StepInfo.stacked(records)
-    return Run(state, steps, end, initial_cost, driver.quick_iterations, driver.compile_s(), total_s)
+    def _ended(self, found: tuple[Carry, StepInfo]) -> tuple[StepInfo, Termination]:
+        """The records of all iterations as one, and why the solve ended."""
+        self.carry, columns = jax.block_until_ready(found)
+        count = int(self.carry.iteration)
+        steps = jax.tree.map(lambda column: np.asarray(column)[:count], columns)
+        return steps, Termination(int(self.carry.termination))
 
 
-def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Compiled | OnDevices | Stepwise:
-    """The way to run the iterations: in stages of compilation, or where somebody looks at them, from Python."""
-    arguments = setup, options.tolerances, options.max_iterations, clock
-    if setup.shards is not None:
-        return OnDevices(setup.shards, *arguments)
-    first = quick_runs_of(options.compilation, setup.placed.here.num_observations, setup.options)
-    if options.max_iterations and (any(first.values()) or not alone):
-        return Stepwise(first, *arguments)
-    return Compiled(*arguments)
+class Compiled(Driver):
+    """All iterations as one program on one device."""
+
+    def begin(self) -> LMState:
+        """The state at the start."""
+        self._start = jax.block_until_ready(self.setup.initial(Program.__call__))
+        return self._start
+
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """Runs to the end; the records of all iterations as one, and why it ended."""
+        setup = self.setup
+        options = setup.policy, self.tolerances, setup.options, self.length, self.limit
+        return self._ended(solve_loop(setup.layout, self._start, *options))
 
 
-def _go_on(record: IterationRecord) -> bool:
-    """A callback that never stops a solve."""
-    return False
+class OnDevices(Driver):
+    """Several devices, all iterations as one program or one at a time."""
 
+    def __init__(self, shards: Shards, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._shards = shards
 
-def _look_away(record: IterationRecord, now: Callable[[], BundleProblem]) -> None:
-    """A watch that does nothing."""
+    def begin(self) -> LMState:
+        """The state at the start."""
+        self.carry = self._shards.begin(self.setup.policy, self.limit)
+        return jax.block_until_ready(self.carry.state)
+
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """See `Compiled`."""
+        return self._ended(self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length))
+
+    def iterate(self) -> tuple[StepInfo, Termination]:
+        """One iteration: its record, of Python scalars, and whether it ended the solve."""
+        self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
+        step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
+        return step, Termination(int(self.carry.termination))

@@ -31,10 +31,6 @@ SHIPPED = {
 """Where the classes of the package's own methods are."""
 
 
-class UnknownMethodError(InputError):
-    """A name is not that of a method. The message is one line for the user."""
-
-
 class _Methods(Mapping[str, StepMethod]):
     """The mapping `METHODS`, made of entry points."""
 
@@ -67,18 +63,18 @@ def make_method(name: str) -> StepMethod:
         name: a key of `METHODS`; methods with clusters of cameras accept their largest size, as in `stba:16`.
 
     Raises:
-        UnknownMethodError: no such method, or an invalid size.
+        InputError: no such method, or an invalid size.
     """
     if name == DEFAULT_METHOD:
         return PLAIN
     base, colon, size = name.partition(":")
     if base not in METHODS:
-        raise UnknownMethodError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
+        raise InputError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
     method = METHODS[base]
     if not colon:
         return method
     if method.cluster_cameras is None:
-        raise UnknownMethodError(f"{name!r}: {base} has no clusters whose size could be set")
+        raise InputError(f"{name!r}: {base} has no clusters whose size could be set")
     if not (size.isdecimal() and int(size) > 0):
-        raise UnknownMethodError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
+        raise InputError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
     return cast(StepMethod, replace(cast(Any, method), cluster_cameras=int(size)))

@@ -13,9 +13,9 @@ from typing import cast, get_args
 from jaxba.damping import DampingPolicy, brings_embedded, make_policy
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.policy import trained_step
-from jaxba.damping.registry import BOLD, BOLD_DRIVER, BOLD_PLAIN, LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
+from jaxba.damping.registry import BOLD, DRIVER, LEARNED, PLAIN, SUFFIX
 from jaxba.problem.options import Refinement, StepOptions
-from jaxba.solver.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
+from jaxba.solver.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.typing import InputError
 
@@ -27,10 +27,6 @@ INNER = "-inner"
 
 PEERS = {"pyceres": ("dense", "sparse", "iterative", f"dense{INNER}", f"sparse{INNER}")}
 """Peer libraries and their modes."""
-
-
-class SolverNameError(InputError):
-    """A name is not that of a solver. The message is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +70,7 @@ class SolverName:
         """The policy, and the options of the solve.
 
         Raises:
-            UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy`, `make_method`.
+            InputError: as `make_policy`, `make_method`.
         """
         alone, peer = self.refine_points == 0, bool(self.peer)
         policy = make_policy(fitting_policy(self.policy, alone=alone, peer=peer))
@@ -120,7 +116,7 @@ def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, Sol
 
     Raises:
         ValueError: the options have another refinement than the name.
-        UnknownPolicyError, PolicyFileError: as `make_policy`.
+        InputError: as `make_policy`.
     """
     policy, _, stated = split_refinement(name)
     if not stated:
@@ -145,22 +141,16 @@ def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> s
     Returns:
         A name for `make_policy`; other names than `learned` and `bold` are unchanged.
     """
-    if policy not in _ALONE or not alone:
+    if policy not in (LEARNED, BOLD) or not alone:
         return policy
-    plain, driver = _ALONE[policy]
-    return driver if peer else plain
-
-
-_ALONE = {LEARNED: (LEARNED_PLAIN, LEARNED_DRIVER), BOLD: (BOLD_PLAIN, BOLD_DRIVER)}
-"""Variants of these policies for steps without refinement: for jaxba's step, and for that of another library."""
+    return policy + (DRIVER if peer else PLAIN)
 
 
 def parse_solver(name: str) -> SolverName:
     """Parses a solver name.
 
     Raises:
-        SolverNameError: an unknown method, mode or type, or a malformed name.
-        UnknownPolicyError: an unknown policy.
+        InputError: an unknown method, mode, type or policy, or a malformed name.
     """
     if name.strip().partition(":")[0] in PEERS:
         return _parse_peer(name.strip())
@@ -183,13 +173,13 @@ def parse_solver(name: str) -> SolverName:
             merged.append(part)
     method = merged.pop(0) if len(merged) > 1 else DEFAULT_METHOD
     if len(merged) != 1 or not merged[0]:
-        raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")
+        raise InputError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")
     try:
         make_method(method)
-    except UnknownMethodError as error:
-        raise SolverNameError(f"{error} (in {name!r})") from None
+    except InputError as error:
+        raise InputError(f"{error} (in {name!r})") from None
     if at and dtype not in DTYPES:
-        raise SolverNameError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
+        raise InputError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
     make_policy(merged[0])
     if brings_embedded(merged[0]) and not stated:
         refine = None
@@ -201,12 +191,12 @@ def _parse_peer(name: str) -> SolverName:
     peer, plus, policy = name.partition("+")
     library, _, mode = peer.partition(":")
     if mode not in PEERS[library]:
-        raise SolverNameError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
+        raise InputError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
     if not plus:
         return SolverName("", peer=peer)
     if mode.endswith(INNER):  # Ceres includes them in its gain ratio, which a policy could not interpret
-        raise SolverNameError(f"{name!r} is no solver; {library} has inner iterations under its own rule alone")
+        raise InputError(f"{name!r} is no solver; {library} has inner iterations under its own rule alone")
     driver = parse_solver(policy)
     if driver != SolverName(driver.policy, driver.refine_points):
-        raise SolverNameError(f"{name!r} is no solver; the form is {peer}+policy[+refineK|+embedded]")
+        raise InputError(f"{name!r} is no solver; the form is {peer}+policy[+refineK|+embedded]")
     return SolverName(driver.policy, driver.refine_points, peer=peer)

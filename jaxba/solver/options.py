@@ -54,8 +54,8 @@ class SolveOptions:
     """Method that computes the step: an entry of `jaxba.METHODS` or its name."""
 
     linear_solver: LinearSolverChoice = "auto"
-    """Solver of the reduced camera system in plain LM; other methods have their own. `auto` chooses by a cost model
-    (cost_model.py)."""
+    """Solver of the reduced camera system in plain LM; other methods have their own. `auto` chooses by predicted time
+    (choose.py)."""
 
     conjugate_gradients: ConjugateGradients = field(default_factory=ConjugateGradients)
     """Conjugate gradients of the linear solvers `sparse` and `implicit`."""
@@ -126,7 +126,7 @@ class SolveOptions:
         """The step options for a policy. The linear solver `auto` is replaced by `explicit`, to be chosen later.
 
         Raises:
-            ValueError, UnknownMethodError: options that exclude each other, or an unknown method.
+            ValueError: options that exclude each other, or an unknown method.
         """
         trained = trained_step(policy)
         method = make_method(self.method) if isinstance(self.method, str) else self.method

@@ -19,7 +19,6 @@ from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import with_unseen_of_frames
 from jaxba.runtime import process
 from jaxba.runtime.numerics import refuse_traces
-from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray
 
@@ -50,11 +49,12 @@ class Placed(NamedTuple):
             state: parameters in layout order.
             options: whether intrinsics were fixed.
         """
-        problem = shift(self.counted, -self.offset)
+        far = self.offset.any()
+        problem = shift(self.counted, -self.offset) if far else self.counted
         points = np.array(problem.points, np.float64)
         seen = np.flatnonzero(layout.camera_seen)  # padding cameras are not seen
         cameras = np.array(self.here.cameras, np.float64)
-        cameras[seen] = items_first(np.asarray(state.cameras, np.float64))[seen]
+        cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
         lenses, rigs = problem.lenses, problem.rigs
         if lenses is not None:  # unobserved cameras follow the others with their lens
             lens = np.asarray(lenses.index)
@@ -70,11 +70,11 @@ class Placed(NamedTuple):
         if rigs is not None:
             cameras = with_unseen_of_frames(rigs, cameras, seen)
         order = np.asarray(order)
-        real = order < problem.num_points
-        points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
+        real = order < len(points)
+        points[order[real]] = np.asarray(state.points, np.float64).T[real]
         found, constants = problem.replace(cameras=cameras, points=points, rigs=rigs), problem.constants
         if constants is None:
-            return shift(found, self.offset)
+            return shift(found, self.offset) if far else found
         poses = np.asarray(constants.poses)
         found = shift(_with_constants(found, problem, constants, poses), self.offset)
         # bit for bit: parts of a translation are constant only where the rotation is, else those of the shifted scene
@@ -103,7 +103,7 @@ def check_problem(problem: BundleProblem) -> None:
     """
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
-    refuse_traces(problem)
+    refuse_traces(vars(problem))
     process.refuse_fork()
 
 

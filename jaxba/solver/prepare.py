@@ -9,12 +9,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState
-from jaxba.lm.step import initial_state
+from jaxba.lm.step import state_of
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside
 from jaxba.problem.options import StepOptions
@@ -27,10 +27,10 @@ from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import Placed, check_problem, placed
 from jaxba.solver.sharded import Shards
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 from jaxba.structure.observation_order import ObservationOrder
-from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
-from jaxba.typing import ArrayRecord
+from jaxba.structure.padding import Capacity, capacity_of, padded_parameters
+from jaxba.typing import AnyArray, ArrayRecord
 
 DEFAULT_POLICY = GUARDED
 """Name of the default damping policy."""
@@ -68,8 +68,8 @@ class Setup(ArrayRecord):
     capacity: Capacity | None
     """Sizes to which the problem was padded; None if it was not."""
 
-    start: BundleProblem
-    """The parameters at the start, placed and padded."""
+    start: tuple[Float[AnyArray, "cameras parameters"], Float[AnyArray, "points 3"]]
+    """Cameras and points at the start, placed and padded."""
 
     dtype: np.dtype[Any]
     """Type of the parameters of the solve."""
@@ -82,8 +82,8 @@ class Setup(ArrayRecord):
 
     def initial(self, call: Callable[..., Any]) -> LMState:
         """The initial state. `call` runs its program, or compiles it (`ParallelCompilation`)."""
-        initial = program(initial_state, "options", "dtype", level="quick")
-        return call(initial, self.layout, self.start, self.options, self.dtype)
+        initial = program(state_of, "options", "dtype", level="quick")
+        return call(initial, self.layout, *self.start, self.options, self.dtype)
 
     def check_cost(self, state: LMState) -> None:
         """Raises a ProblemError that names an observation if the cost of the initial state is not finite."""
@@ -95,6 +95,8 @@ class Setup(ArrayRecord):
         points = np.moveaxis(distributed.to_host(state.points), -2, 0).reshape(3, -1)  # of several shards
         order = self.layout.points if self.shards is None else self.shards.order
         found = self.placed.after(self.layout, order, state._replace(points=points), self.options)
+        if not len(self.away):
+            return found
         return self.problem.replace(cameras=found.cameras, points=found.points, rigs=found.rigs)
 
 
@@ -163,21 +165,24 @@ def set_up(
             )
         observations = ObservationOrder.of(here)
         capacity, asked = None, options.linear_solver
-        if len(devices) == 1 and _pads(here, options):
-            capacity, asked = with_padded_solver(capacity_of(here, observations), step, asked)
+        if len(devices) == 1 and not step.method and asked in ("auto", "explicit") and _pads(observations, options):
+            # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up to the
+            # largest capacity the explicit solver is never slow
+            capacity = capacity_of(here, observations)
+            asked = asked if capacity is None else "explicit"
         step = choose_linear_solver(here, step, asked, observations, len(devices))
         shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
-        layout = jax.device_put(layout_for(here, step, capacity, observations)) if shards is None else shards.first
-        start = here if capacity is None else padded_parameters(here, capacity)
+        layout = jax.device_put(build_layout(here, step, capacity, observations)) if shards is None else shards.first
+        start = (here.cameras, here.points) if capacity is None else padded_parameters(here, capacity)
         setup_s = time.perf_counter() - started
     return Setup(problem, away, found, layout, step, policy, capacity, start, dtype, setup_s, shards)
 
 
-def _pads(problem: BundleProblem, options: SolveOptions) -> bool:
+def _pads(observations: ObservationOrder, options: SolveOptions) -> bool:
     """Whether sizes are to be padded, if they can be."""
     if options.pad is not None:
         return options.pad
-    small = problem.num_cameras <= PADDED_CAMERAS and problem.num_observations <= PADDED_OBSERVATIONS
+    small = observations.num_cameras <= PADDED_CAMERAS and len(observations.order) <= PADDED_OBSERVATIONS
     return small and options.compilation != "full"
 
 

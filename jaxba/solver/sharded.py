@@ -1,14 +1,19 @@
 """The solve loop on several devices, as one program.
 
-Points are divided among the devices of a mesh with their observations (structure/shards.py); cameras, the state of the
-policy and all decisions are on every device. The step is the same as on one device: what is summed over points or
-observations is summed over devices, too (structure/devices.py).
+Points are divided among the devices of a mesh with their observations; cameras, the state of the policy and all
+decisions are on every device. The step is the same as on one device: what is summed over points or observations is
+summed over devices, too (structure/devices.py).
+
+Points are dealt to the shards by descending track length, so that each has nearly the same number of points of every
+length, and of observations. Sizes of arrays and lists of blocks must be the same in all shards; they follow from data,
+so that layouts are built again with what was found (`Agreement`), until nothing changes.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -26,17 +31,20 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.jit import jit
-from jaxba.solver.compiled import loop_from
-from jaxba.solver.iteration import Carry, begin, iterate, problem_info
+from jaxba.solver.iteration import Carry, begin, iterate, loop_from, problem_info
+from jaxba.structure.agreement import Agreement, merged, same
 from jaxba.structure.devices import AXIS
-from jaxba.structure.layout import Layout
-from jaxba.structure.shards import deal_points, shard_of, sharded_layout
+from jaxba.structure.layout import Layout, build_layout
 
 _DIVIDED, _EVERYWHERE = PartitionSpec(AXIS), PartitionSpec()
 _STATE: Any = _EVERYWHERE, _DIVIDED, _EVERYWHERE
 _REST: Any = (_EVERYWHERE,) * 4
 _CARRY = Carry(LMState(*_STATE), *_REST)
 """Where the parts of a carry are: points are divided, all else is on every device."""
+
+
+MAX_ROUNDS = 8
+"""Most times that layouts are built until they agree; three or four suffice."""
 
 
 class Shards:
@@ -168,3 +176,39 @@ def _run(
     places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
     on_all = jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
     return on_all(layout, carry, policy, tolerances, limit)
+
+
+def deal_points(tracks: Int[np.ndarray, " points"], shards: int) -> list[Int[np.ndarray, " _"]]:
+    """The observed points of each shard, ascending: dealt by track length, forwards and backwards in turns."""
+    order = np.argsort(-tracks, kind="stable")[: np.count_nonzero(tracks)]
+    turn, position = np.divmod(np.arange(len(order)), shards)
+    shard = np.where(turn % 2 == 0, position, shards - 1 - position)
+    return [np.sort(order[shard == number]) for number in range(shards)]
+
+
+def shard_of(problem: BundleProblem, points: Int[np.ndarray, " kept"]) -> BundleProblem:
+    """The problem with all cameras and these points, ascending, and their observations."""
+    own = np.zeros(problem.num_points, bool)
+    own[points] = True
+    return problem.subset(own[problem.point_index], points=points)
+
+
+def sharded_layout(
+    shards: list[BundleProblem], options: StepOptions, merge: Callable[[list[dict]], list[dict]] = lambda found: found
+) -> list[Layout]:
+    """The layouts of shards, of equal shapes.
+
+    Args:
+        shards: of one problem, `in_frames` if it has rigs.
+        options: of the step.
+        merge: from what was found here to what was found in all processes.
+    """
+    known: dict[str, Any] = {}
+    for _ in range(MAX_ROUNDS):
+        agreements = [Agreement(known) for _ in shards]
+        layouts = [build_layout(shard, options, agreement=one) for shard, one in zip(shards, agreements, strict=True)]
+        found = merged(merge([one.found for one in agreements]))
+        if same(found, known):
+            return [replace(layout, axes=(AXIS,)) for layout in layouts]
+        known = found
+    raise RuntimeError("the layouts of shards do not agree")

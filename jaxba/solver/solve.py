@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -13,11 +15,13 @@ from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
+from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import cost_of_rounding
-from jaxba.solver.loop import Callback, Watch, run
+from jaxba.solver.loop import Callback, Compiled, IterationRecord, OnDevices, Watch
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, set_up
+from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
+from jaxba.solver.stepwise import Stepwise, quick_runs_of
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
 
@@ -140,33 +144,63 @@ def solve_without(
     """`solve` where it is known which images face away; None: it is not."""
     options = checked_options(options)
     setup = set_up(problem, policy, options, away)
-    counted = setup.placed.counted
-    with numerics(setup.dtype):
-        state, steps, termination, initial_cost, quick_iterations, compile_s, total_s = run(
-            setup, options, callback, watch
-        )
+    counted, alone = setup.placed.counted, callback is None and watch is None
+    with numerics(setup.dtype), CompileClock() as clock:
+        driver = _driver(setup, options, clock, alone)
+        state = driver.begin()
+        setup.check_cost(state)
+        initial_cost, compiled, watched, began = float(state.cost), driver.compile_s(), 0.0, time.perf_counter()
+        elapsed = lambda: time.perf_counter() - began - watched - (driver.compile_s() - compiled)
+        steps, records = None, []
+        end = Termination.RUNNING if options.max_iterations else Termination.MAX_ITERATIONS
+        if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise):
+            steps, end = driver.finish()
+        while end == Termination.RUNNING and not isinstance(driver, Compiled):
+            step, end = driver.iterate()
+            records.append(step)
+            record = IterationRecord(len(records), elapsed(), step)
+            looked = time.perf_counter()
+            if watch:
+                watch(record, functools.partial(setup.problem_at, driver.carry.state))
+            watched += time.perf_counter() - looked
+            if callback and callback(record) and end == Termination.RUNNING:
+                end = Termination.STOPPED
+        total_s, compile_s = elapsed(), driver.compile_s()
         if compile_s > 0:
             process.release_programs()  # see above: too many programs end a process
+        steps = steps or StepInfo.stacked(records)
+        state = driver.carry.state if options.max_iterations else state
         count, final_cost = len(steps.cost), float(state.cost)
-        gave_up = termination in (Termination.DAMPING_LIMIT, Termination.STALLED)
+        gave_up = end in (Termination.DAMPING_LIMIT, Termination.STALLED)
         if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
-            termination = Termination.ROUNDING
+            end = Termination.ROUNDING
         return Solution(
             problem=setup.problem_at(state) if count else _unchanged(counted),
             initial_cost=initial_cost,
             final_cost=final_cost,
             iterations=count,
             accepted=int(np.sum(steps.accepted)),
-            termination=termination,
+            termination=end,
             history=steps,
             linear_solver=setup.options.solver_name,
             setup_s=setup.setup_s,
             compile_s=compile_s,
             total_s=total_s,
             capacity=setup.capacity,
-            quick_iterations=quick_iterations,
+            quick_iterations=driver.quick_iterations,
             set_aside=setup.away,
         )
+
+
+def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Compiled | OnDevices | Stepwise:
+    """The way to run the iterations: in stages of compilation, or where somebody looks at them, from Python."""
+    arguments = setup, options.tolerances, options.max_iterations, clock
+    if setup.shards is not None:
+        return OnDevices(setup.shards, *arguments)
+    first = quick_runs_of(options.compilation, len(setup.placed.here.camera_index), setup.options)
+    if options.max_iterations and (any(first.values()) or not alone):
+        return Stepwise(first, *arguments)
+    return Compiled(*arguments)
 
 
 def _unchanged(problem: BundleProblem) -> BundleProblem:

@@ -12,7 +12,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from enum import IntEnum
 from typing import Any
 
 import jax
@@ -39,8 +38,8 @@ from jaxba.runtime.compilation import (
     program,
     quick_runs,
 )
-from jaxba.solver.driver import Driver
 from jaxba.solver.iteration import Carry, advance, begin, problem_info
+from jaxba.solver.loop import Driver
 from jaxba.structure.layout import Layout, num_partitions
 
 Call = Callable[..., Any]
@@ -149,12 +148,8 @@ def quick_runs_of(compilation: Compilation, observations: int, options: StepOpti
     return {name: quick_runs(part, observations) for name, part in parts.items()}
 
 
-class Next(IntEnum):
-    """What a search does next."""
-
-    NOTHING = 0
-    CANDIDATE = 1
-    CAMERA_ROUND = 2
+NOTHING, CANDIDATE, CAMERA_ROUND = range(3)
+"""What a search does next."""
 
 
 def try_candidate(
@@ -169,7 +164,7 @@ def try_candidate(
     """One turn of the search for the candidate of a step, and what comes next. Arguments as for `next_search`."""
     against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain)
     search = next_search(against, search, refined)
-    following = jnp.where(search.active, jnp.where(search.refining, Next.CAMERA_ROUND, Next.CANDIDATE), Next.NOTHING)
+    following = jnp.where(search.active, jnp.where(search.refining, CAMERA_ROUND, CANDIDATE), NOTHING)
     return search, following
 
 
@@ -201,9 +196,9 @@ def try_step_by_parts(
     while True:
         arguments = (layout, state, proposal, options, min_gain, search, refined)
         search, following = call(part(try_candidate), *arguments)
-        if not isinstance(following, Array) or int(following) == Next.NOTHING:
+        if not isinstance(following, Array) or int(following) == NOTHING:
             break
-        if int(following) == Next.CAMERA_ROUND:
+        if int(following) == CAMERA_ROUND:
             refined = call(part(camera_round), layout, search.candidate, options)
     return call(program(take_step, "options", level="quick"), layout, state, damping, proposal, search.best, options)
 

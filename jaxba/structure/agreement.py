@@ -9,87 +9,59 @@ import numpy as np
 
 
 class Agreement:
-    """What a layout asks by name, with what it needs itself: here that of the only shard, which needs nothing more."""
+    """Asked by name by the layout of one of several shards, with what it needs itself; knows what all of them need as
+    far as it was found in the round before. `ALONE` is that of the only shard, which needs nothing more."""
+
+    def __init__(
+        self, known: dict[str, Any] | None = None, found: dict[str, Any] | None = None, prefix: str = ""
+    ) -> None:
+        self._known, self._prefix = known, prefix
+        self.found: dict[str, Any] = {} if found is None else found
 
     def within(self, name: str) -> Agreement:
         """The same for a part, whose names begin with that of the part."""
-        return self
+        return Agreement(self._known, self.found, f"{self._prefix}{name}.")
 
     def size(self, name: str, own: int) -> int:
         """The largest of a number in all shards."""
-        return own
+        return max(own, self._asked(name, own))
 
     def others(self, name: str, own: Callable[[], np.ndarray]) -> np.ndarray:
         """Sorted keys of all shards; none if there are no others."""
-        return np.zeros(0, np.int64)
+        return np.zeros(0, np.int64) if self._known is None else self.union(name, np.unique(own()))
 
     def union(self, name: str, own: np.ndarray) -> np.ndarray:
         """The sorted union of keys, sorted ones, in all shards."""
-        return own
+        return np.union1d(own, self._asked("union " + name, own))
 
     def total(self, name: str, own: Any) -> Any:
         """The sum over all shards of an array or a sparse matrix."""
-        return own
+        return self._asked("total " + name, own)
+
+    def _asked(self, name: str, own: Any) -> Any:
+        if self._known is None:
+            return own
+        self.found[self._prefix + name] = own
+        return self._known.get(self._prefix + name, own)
 
 
 ALONE = Agreement()
 
 
-class Round(Agreement):
-    """What one of several shards needs, and what all need as far as it is known from the round before."""
+def merged(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """What all shards need."""
+    result = {}
+    for key in dict.fromkeys(name for one in found for name in one):
+        values = [one[key] for one in found if key in one]
+        kind = key.rpartition(".")[2].partition(" ")[0]
+        if kind == "union":
+            result[key] = np.unique(np.concatenate(values))
+        else:
+            result[key] = sum(values[1:], values[0]) if kind == "total" else max(values)
+    return result
 
-    def __init__(self, known: dict[str, Any], found: dict[str, Any] | None = None, prefix: str = "") -> None:
-        self._known = known
-        self._prefix = prefix
-        self.found: dict[str, Any] = {} if found is None else found
 
-    def within(self, name: str) -> Agreement:
-        """See `Agreement`."""
-        return Round(self._known, self.found, f"{self._prefix}{name}.")
-
-    def size(self, name: str, own: int) -> int:
-        """See `Agreement`."""
-        self.found[self._prefix + name] = own
-        return max(own, self._known.get(self._prefix + name, own))
-
-    def others(self, name: str, own: Callable[[], np.ndarray]) -> np.ndarray:
-        """See `Agreement`."""
-        return self.union(name, np.unique(own()))
-
-    def union(self, name: str, own: np.ndarray) -> np.ndarray:
-        """See `Agreement`."""
-        key = self._prefix + "union " + name
-        self.found[key] = own
-        return np.union1d(own, self._known.get(key, own))
-
-    def total(self, name: str, own: Any) -> Any:
-        """See `Agreement`."""
-        key = self._prefix + "total " + name
-        self.found[key] = own
-        return self._known.get(key, own)
-
-    @staticmethod
-    def merged(found: list[dict[str, Any]]) -> dict[str, Any]:
-        """What all shards need."""
-        result = {}
-        for key in dict.fromkeys(name for one in found for name in one):
-            values = [one[key] for one in found if key in one]
-            kind = key.rpartition(".")[2].partition(" ")[0]
-            if kind == "union":
-                result[key] = np.unique(np.concatenate(values))
-            elif kind == "total":
-                result[key] = sum(values[1:], values[0])
-            else:
-                result[key] = max(values)
-        return result
-
-    @staticmethod
-    def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-        """Whether two rounds found the same."""
-
-        def equal(a: Any, b: Any) -> bool:
-            if hasattr(a, "nnz"):
-                return (a != b).nnz == 0
-            return np.array_equal(a, b)
-
-        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two rounds found the same."""
+    equal = lambda a, b: (a != b).nnz == 0 if hasattr(a, "nnz") else np.array_equal(a, b)
+    return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)

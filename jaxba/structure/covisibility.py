@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.structure.padding import Capacity, room_for
-from jaxba.structure.sum_trees import TREE_WIDTH, Exact, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
+from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
 PAIR_CHUNKS = (4, 8)
@@ -23,10 +23,6 @@ PAIR_CHUNKS = (4, 8)
 
 PAIR_BATCH = 2048
 """Most chunks per batch. It bounds the gathered operands to 7 MB and the products to 1.3 MB, so that they stay in the
-cache."""
-
-MAX_COUNTED_BLOCKS = 1 << 18
-"""Largest number of possible blocks, cameras squared, for which pairs are sorted by counting: the counts fit the
 cache."""
 
 PAIR_ITEM_COST = 1.5
@@ -130,7 +126,7 @@ def pair_layout(
         listed = np.tril_indices(cameras)
     listed = np.maximum(*listed) * np.int64(cameras) + np.minimum(*listed)
     keys, counts, order = _sorted_by_block(rows, columns, cameras, listed)
-    room = Exact.of(counts) if capacity is None else room_for(counts, capacity.pairs, capacity.points)
+    room = Room.of(counts) if capacity is None else room_for(counts, capacity.pairs, capacity.points)
     largest = PAIR_BATCH if capacity is None else -(-PAIR_BATCH // 2)  # smaller ones, of which the last is rarely full
 
     number_of = lambda width: agreement.size(f"chunks of {width}", room.chunks(room.items, counts, width))
@@ -286,17 +282,9 @@ def _sorted_by_block(
     Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable.
     """
     listed = np.append(listed, np.arange(cameras, dtype=np.int64) * (cameras + 1))
-    if cameras**2 <= MAX_COUNTED_BLOCKS:
-        pair_keys = rows * np.int32(cameras) + columns
-        counts = np.bincount(pair_keys, minlength=cameras**2)
-        has_pairs = counts > 0
-        has_pairs[listed] = True
-        keys = np.flatnonzero(has_pairs)
-        return keys, counts[keys], sorted_by(pair_keys, cameras**2)
-    # by column, then by row
-    order = sorted_by(columns, cameras)
-    order = order[sorted_by(rows[order], cameras)]
-    keys = rows[order].astype(np.int64) * cameras + columns[order]
+    pair_keys = rows.astype(np.int64) * cameras + columns
+    order = sorted_by(pair_keys, cameras**2)
+    keys = pair_keys[order]
     first = np.flatnonzero(np.diff(keys, prepend=-1))
     every = np.union1d(keys[first], listed)
     counts = np.zeros(len(every), np.int64)

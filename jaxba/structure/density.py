@@ -6,8 +6,6 @@ where Woodbury's identity replaces the system by one of the size of the points (
 
 from __future__ import annotations
 
-import numpy as np
-
 from jaxba.structure.observation_order import ObservationOrder
 
 MIN_DENSITY = 0.1
@@ -33,19 +31,6 @@ def has_small_capacitance(columns: int, cameras: int) -> bool:
     return 3 * columns <= DENSE_UNKNOWNS and has_few_points(columns, cameras)
 
 
-def has_dense_shape(tracks: np.ndarray, cameras: int, columns: int) -> bool:
-    """`is_dense` from track lengths alone, for a problem in which no camera sees a point twice.
-
-    Args:
-        tracks: number of observations of each point.
-        cameras: number of cameras.
-        columns: number of points in layout order, including padding.
-    """
-    pairs = float(np.sum(tracks * (tracks + 1.0)) / 2)
-    dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > MIN_DENSITY * np.count_nonzero(tracks) * cameras**2
-    return bool(dense or has_small_capacitance(columns, cameras))
-
-
 def is_dense(observations: ObservationOrder, cameras: int, columns: int) -> bool:
     """Whether one dense product is cheaper than listed pairs. Impossible if a camera sees a point twice.
 
@@ -54,4 +39,6 @@ def is_dense(observations: ObservationOrder, cameras: int, columns: int) -> bool
         cameras: number of cameras, including padding.
         columns: number of points in layout order, including padding.
     """
-    return has_dense_shape(observations.tracks, cameras, columns) and not observations.num_repeated_pairs
+    pairs, points = observations.num_pairs, observations.num_observed_points
+    dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > MIN_DENSITY * points * cameras**2
+    return (dense or has_small_capacitance(columns, cameras)) and not observations.num_repeated_pairs

@@ -17,6 +17,10 @@ With a fixed capacity (structure/padding.py) there are no buckets. Slots form ch
 points are sorted by track length, so that those with an r-th chunk are the first ones, and sums over points are sums
 over r of gathered chunks.
 
+The state, the camera model and all arrays over observations are components-first: cameras are `[9, cameras]`, points
+`[3, points]`, so that every component is a contiguous vector. Linear algebra and a `BundleProblem` are items-first:
+steps, gradients and right-hand sides of the reduced camera system are `[cameras, 9]`, its blocks `[cameras, 9, 9]`.
+
 Everything is computed once per problem, on the host, with vectorised NumPy.
 """
 
@@ -29,7 +33,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
@@ -120,35 +124,37 @@ class Layout(ArrayRecord):
         """Number of cameras, observed or not."""
         return self.camera_seen.shape[-1]
 
+    def part(self, name: str) -> Any:
+        """Pairs, grid, clusters or partitions; a ValueError if the options that it was built for do not need them."""
+        if getattr(self, name) is None:
+            raise ValueError(f"this layout has no {name}: build it with the options of the step")
+        return getattr(self, name)
+
+
+NO_SYSTEM = StepOptions(linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi"))
+"""Options of a step whose layout has slots and their sums alone."""
+
 
 def build_layout(
     problem: BundleProblem,
-    *,
-    pairs: bool = True,
-    factor: bool = True,
-    clusters: bool = False,
-    grid: bool = True,
-    partitions: int | None = None,
+    options: StepOptions = StepOptions(),  # noqa: B008 - immutable
     capacity: Capacity | None = None,
-    fixed_intrinsics: bool = False,
     observations: ObservationOrder | None = None,
+    *,
+    grid: bool = True,
     agreement: Agreement = ALONE,
 ) -> Layout:
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
     Args:
-        problem: a checked problem; host arrays.
-        pairs: whether to list the pairs of observations that form the reduced camera system. Their number is the sum
-            of `t (t + 1) / 2` over track lengths t.
-        factor: whether that system will be factored, which takes a table of its blocks, dense or banded.
-        clusters: whether to cluster cameras for the two-level preconditioner.
+        problem: a checked problem, `in_frames` if it has rigs; host arrays.
+        options: of the step: the layout has exactly the parts that it needs. If it forms the reduced camera system, it
+            lists pairs of observations: `t (t + 1) / 2` of each point with t observations.
+        capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
+        observations: the sorted observations of the problem, if they are known already.
         grid: whether a factored system may be formed as one dense matrix product instead of from pairs, where that is
             cheaper (structure/density.py).
-        partitions: largest number of cameras in a cluster, to draw random partitions of the cameras; needs pairs.
-        capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
-        fixed_intrinsics: whether all intrinsics are constant.
-        observations: the sorted observations of the problem, if they are known already.
-        agreement: with the layouts of the other shards of a problem (structure/shards.py).
+        agreement: with the layouts of the other shards of a problem (solver/sharded.py).
 
     Returns:
         A pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the problem.
@@ -159,12 +165,13 @@ def build_layout(
     Raises:
         ValueError: arguments that exclude each other, or a problem larger than the capacity.
     """
-    if capacity is not None and (clusters or partitions is not None or not factor):
-        raise ValueError("only layouts for a factored system are padded: no clusters, no partitions, factor=True")
-    if capacity is not None and not capacity.holds(problem):
-        raise ValueError(f"the problem is larger than the capacity: {capacity}")
-    cameras = problem.num_cameras if capacity is None else capacity.cameras
+    factor, pairs = options.factors_reduced_system, options.forms_reduced_system
+    if capacity is not None and not factor:
+        raise ValueError("only layouts for a factored system are padded")
     observations = observations or ObservationOrder.of(problem)
+    if capacity is not None and not capacity.holds(observations):
+        raise ValueError(f"the problem is larger than the capacity: {capacity}")
+    cameras = observations.num_cameras if capacity is None else capacity.cameras
     camera, tracks, order = observations.camera, observations.tracks, observations.order
     seen = np.bincount(camera, minlength=cameras)
     is_seen = agreement.total("seen", seen) > 0
@@ -183,7 +190,7 @@ def build_layout(
     by_camera = sorted_by(camera, cameras)
     levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, agreement.within("cameras"))
     camera_levels = with_spare_row(levels, empty)
-    unknowns = unknowns_of(problem, is_seen, slots.points, fixed=fixed_intrinsics, agreement=agreement)
+    unknowns = unknowns_of(problem, is_seen, slots.points, fixed=options.intrinsics == "fixed", agreement=agreement)
     pair_lists = slot_grid = drawn_partitions = camera_clusters = None
     dense = pairs and factor and grid and is_dense(observations, cameras, len(slots.points))
     if agreement.size("listed pairs", int(not dense)) == 0:  # in all shards or none
@@ -205,17 +212,15 @@ def build_layout(
             capacity=capacity,
             agreement=agreement.within("pairs"),
         )
-    if partitions is not None:
-        if pair_lists is None:
-            raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
-        drawn_partitions = partition_layout(observations, slots, pair_lists, partitions)
-    if clusters:
+    if options.cluster_cameras is not None and pair_lists is not None:
+        drawn_partitions = partition_layout(observations, slots, pair_lists, options.cluster_cameras)
+    if options.uses_camera_clusters:
         camera_clusters = cluster_layout(observations, slots, unknowns.lenses, agreement.within("clusters"))
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slots.point,
         slot_mask=in_slots(np.ones(len(camera), bool)),
-        observation=in_slots(order.astype(np.int32), problem.num_observations),
+        observation=in_slots(order.astype(np.int32), len(order)),
         pixels=in_order(problem.observations),
         whitening=None if problem.whitening is None else in_order(problem.whitening),
         points=slots.points,
@@ -231,38 +236,6 @@ def build_layout(
     )
 
 
-def layout_for(
-    problem: BundleProblem,
-    options: StepOptions,
-    capacity: Capacity | None = None,
-    observations: ObservationOrder | None = None,
-    agreement: Agreement = ALONE,
-) -> Layout:
-    """The layout with exactly the parts that a step with these options needs. Arguments as for `build_layout`."""
-    return build_layout(
-        problem,
-        pairs=options.forms_reduced_system,
-        factor=options.factors_reduced_system,
-        clusters=options.uses_camera_clusters,
-        partitions=options.cluster_cameras,
-        capacity=capacity,
-        fixed_intrinsics=options.intrinsics == "fixed",
-        observations=observations,
-        agreement=agreement,
-    )
-
-
 def num_partitions(layout: Layout) -> int:
     """Number of partitions that iterations cycle through, and so of different steps from one state and lambda."""
     return 1 if layout.partitions is None else layout.partitions.label.shape[0]
-
-
-def partition_of(layout: Layout) -> Partition:
-    """The partitions of a layout.
-
-    Raises:
-        ValueError: it was built without them.
-    """
-    if layout.partitions is None:
-        raise ValueError("this layout has no partitions: build it with partitions=, the cameras of a cluster at most")
-    return layout.partitions

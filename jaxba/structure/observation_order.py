@@ -35,10 +35,10 @@ class ObservationOrder:
     def of(cls, problem: BundleProblem) -> ObservationOrder:
         """Sorts the observations of a problem in linear time; ties keep the order of the problem."""
         camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
-        order = sorted_by(camera, problem.num_cameras)
-        order = order[sorted_by(point[order], problem.num_points)]
-        tracks = np.bincount(point, minlength=problem.num_points)
-        return cls(order, camera[order], point[order], tracks, problem.num_cameras)
+        cameras, points = len(problem.cameras), len(problem.points)
+        order = sorted_by(camera, cameras)
+        order = order[sorted_by(point[order], points)]
+        return cls(order, camera[order], point[order], np.bincount(point, minlength=points), cameras)
 
     @cached_property
     def start(self) -> Int[np.ndarray, " points_and_one"]:

@@ -17,10 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
-from jaxba.problem.options import LinearSolverChoice, StepOptions
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
@@ -65,10 +64,9 @@ class Capacity:
     pairs: int
     """Number of pairs of observations of one point, an observation with itself included."""
 
-    def holds(self, problem: BundleProblem) -> bool:
+    def holds(self, observations: ObservationOrder) -> bool:
         """Whether the problem fits; its pairs are not counted."""
-        tracks = np.bincount(problem.point_index, minlength=problem.num_points)
-        counts = problem.num_cameras, problem.num_points, slots_for(tracks)
+        counts = observations.num_cameras, len(observations.tracks), slots_for(observations.tracks)
         return all(n <= most for n, most in zip(counts, (self.cameras, self.points, self.observations), strict=True))
 
     def usual_observations(self, count: int) -> int:
@@ -96,18 +94,19 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
     """
     general = problem.lenses is not None or problem.constants is not None or problem.priors is not None
     general = general or problem.rigs is not None
-    if general or problem.num_cameras > MAX_CAMERAS:
-        return None
     observations = observations or ObservationOrder.of(problem)
+    cameras, points = observations.num_cameras, len(observations.tracks)
+    if general or cameras > MAX_CAMERAS:
+        return None
     needed = slots_for(observations.tracks)
     # if a camera sees a point twice, the pair is listed in both orders (covisibility.py)
     pairs = observations.num_pairs + observations.num_repeated_pairs
     if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
         return None
     slots = _eighth_octave(max(MIN_OBSERVATIONS, needed))
-    chunks, points = slots // POINT_CHUNK, problem.num_points
+    chunks = slots // POINT_CHUNK
     return Capacity(
-        cameras=next(size for size in CAMERAS if size >= problem.num_cameras),
+        cameras=next(size for size in CAMERAS if size >= cameras),
         points=next(room for share in POINTS_PER_CHUNK if (room := int(share * chunks)) >= points),
         observations=slots,
         pairs=slots * PAIRS_PER_SLOT * _power(-(-pairs // (slots * PAIRS_PER_SLOT))),
@@ -136,33 +135,12 @@ def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> 
     return Room(items, min(items, expected) if counts.max(initial=0) <= expected else items)
 
 
-def with_padded_solver(
-    capacity: Capacity | None, options: StepOptions, asked: LinearSolverChoice
-) -> tuple[Capacity | None, LinearSolverChoice]:
-    """Restricts padding to the explicit solver, which `auto` then means.
-
-    The choice of `auto` depends on the exact sizes of a problem, so that problems of one capacity might get different
-    programs. Up to the largest capacity the explicit solver is never slow.
-
-    Args:
-        capacity: of the problem; None if it is not padded.
-        options: options of the step, with its method.
-        asked: the requested linear solver.
-
-    Returns:
-        The capacity (None if another solver or a method is requested) and the linear solver to use.
-    """
-    if options.method or asked not in ("auto", "explicit"):
-        return None, asked
-    return capacity, asked if capacity is None else "explicit"
-
-
-def padded_parameters(problem: BundleProblem, capacity: Capacity) -> BundleProblem:
-    """The problem's cameras and points, padded with zeros to the capacity, without observations."""
-    cameras, points = np.zeros((capacity.cameras, CAMERA_SIZE)), np.zeros((capacity.points, POINT_SIZE))
-    cameras[: problem.num_cameras], points[: problem.num_points] = problem.cameras, problem.points
-    nothing = np.zeros(0, np.int32)
-    return BundleProblem(cameras, points, np.zeros((0, 2)), nothing, nothing)
+def padded_parameters(
+    problem: BundleProblem, capacity: Capacity
+) -> tuple[Float[np.ndarray, "cameras 9"], Float[np.ndarray, "points 3"]]:
+    """The problem's cameras and points, padded with zeros to the capacity."""
+    padded = lambda rows, count: np.pad(np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0)))
+    return padded(problem.cameras, capacity.cameras), padded(problem.points, capacity.points)
 
 
 def _power(count: int) -> int:

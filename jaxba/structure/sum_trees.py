@@ -26,22 +26,17 @@ class Room(NamedTuple):
     most: int
     """Largest number of items of one target."""
 
-    def chunks(self, items: int, counts: Int[np.ndarray, " targets"], width: int) -> int:
-        """Room for the chunks of so many items at most, for any number of each target."""
-        return chunks_at_most(items, len(counts), width)
-
-
-class Exact(Room):
-    """The numbers of the data themselves, so that shapes depend on them."""
+    exact: bool = False
+    """Whether these are the numbers of the data themselves, so that shapes depend on them."""
 
     @classmethod
-    def of(cls, counts: Int[np.ndarray, " targets"]) -> Exact:
-        """Of targets with so many items."""
-        return cls(int(counts.sum()), int(counts.max(initial=1)))
+    def of(cls, counts: Int[np.ndarray, " targets"]) -> Room:
+        """Exactly that of targets with so many items."""
+        return cls(int(counts.sum()), int(counts.max(initial=1)), exact=True)
 
     def chunks(self, items: int, counts: Int[np.ndarray, " targets"], width: int) -> int:
-        """The chunks of targets with so many items."""
-        return int((-(-counts // width)).sum())
+        """The chunks of targets with so many items or, unless exact, room for any numbers of at most `items` in all."""
+        return int((-(-counts // width)).sum()) if self.exact else chunks_at_most(items, len(counts), width)
 
 
 def sum_tree(
@@ -71,8 +66,8 @@ def sum_tree(
         ValueError: the items exceed the room.
     """
     levels = []
-    room = room or Exact.of(counts)
-    space, most = room
+    room = room or Room.of(counts)
+    space, most, _ = room
     if len(items) > space or counts.max(initial=0) > most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
     most = agreement.size("most", most)

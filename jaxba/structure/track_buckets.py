@@ -42,23 +42,12 @@ PENALTIES = 16
 class Slots(NamedTuple):
     """The assignment of observations, sorted by point, to slots."""
 
-    slot: Int[np.ndarray, " observations"]
-    """Slot of each observation."""
-
-    point: Int[np.ndarray, " slots"]
-    """Point of each slot in layout order, for empty slots too."""
-
-    points: Int[np.ndarray, " points"]
-    """Index in the problem of the points in layout order; padding points have an index out of range."""
-
-    buckets: tuple[Bucket, ...]
-    """Shape of each bucket; empty for a layout with fixed capacity."""
-
-    levels: tuple[Int[np.ndarray, "_ _"], ...] | None
-    """Ranks of chunks that are added to the first one of each point (`sum_trees.prefix_levels`); None for buckets."""
-
-    empty: int
-    """An empty slot."""
+    slot: Int[np.ndarray, " observations"]  # of each observation
+    point: Int[np.ndarray, " slots"]  # of each slot in layout order, for empty slots too
+    points: Int[np.ndarray, " points"]  # see `Layout.points`
+    buckets: tuple[Bucket, ...]  # see `Layout.buckets`
+    levels: tuple[Int[np.ndarray, "_ _"], ...] | None  # see `Layout.point_levels`
+    empty: int  # an empty slot
 
 
 def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALONE) -> Slots:

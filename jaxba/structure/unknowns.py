@@ -92,12 +92,6 @@ class Unknowns(ArrayRecord):
         return self.poses.several or self.lenses.several
 
     @property
-    def plain(self) -> bool:
-        """Whether all numbers of BAL cameras and points are optimised, each by itself, and nothing else."""
-        whole = self.models == (BAL,) and len(self.columns) == self.size
-        return whole and self.free.everywhere and self.free_points.everywhere and not (self.shared or self.priors)
-
-    @property
     def width(self) -> int:
         """Number of unknowns in a camera's block."""
         return POSE_SIZE + len(self.columns)
@@ -171,24 +165,25 @@ def unknowns_of(
         fixed: whether all intrinsics are constant.
         agreement: with the other shards of the problem, some of whose points may be constant.
     """
-    lenses = problem.lenses or Lenses(np.arange(problem.num_cameras), np.ones((problem.num_cameras, LENS_SIZE), bool))
-    padding, index = len(seen) - problem.num_cameras, np.asarray(lenses.index)
+    cameras, points = len(problem.cameras), len(problem.points)
+    lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
+    padding, index = len(seen) - cameras, np.asarray(lenses.index)
     poses_free = free_poses(problem)
     lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:]])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
     free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
     free = np.pad(free, ((0, padding), (0, 0)), constant_values=True)
-    held = np.zeros(problem.num_points, bool) if problem.constants is None else np.asarray(problem.constants.points)
+    held = np.zeros(points, bool) if problem.constants is None else np.asarray(problem.constants.points)
     any_held = agreement.size("constant points", int(held.any()))
     apart = -1 - np.arange(len(seen))  # names of cameras that have nothing in common
     padded = lambda names: np.where(seen, np.pad(names, (0, padding)), apart)
     shares = Sharing.of(padded(index))
-    model = np.zeros(problem.num_cameras, np.int32) if lenses.model is None else np.asarray(lenses.model)[index]
+    model = np.zeros(cameras, np.int32) if lenses.model is None else np.asarray(lenses.model)[index]
     return Unknowns(
         poses=Sharing.of(apart if problem.rigs is None else padded(_frames(problem))),
         lenses=shares if columns else Sharing.of(apart),
         free=Mask.of(free.T),
-        free_points=Mask(np.append(~held, True)[np.minimum(order, problem.num_points)], not any_held),
+        free_points=Mask(np.append(~held, True)[np.minimum(order, points)], not any_held),
         model=np.pad(model, (0, padding)),
         priors=_camera_priors(problem, index, seen),
         models=lenses.models,

@@ -13,8 +13,7 @@ from support import step_info
 
 from jaxba.damping import features
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.clock import DURATIONS, duration
-from jaxba.damping.features import PAPER_LIMIT, observation_size
+from jaxba.damping.features import DURATIONS, PAPER_LIMIT, duration, observation_size
 
 awkward = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e300, -1e300, np.nan, np.inf, -np.inf])
 

@@ -86,9 +86,8 @@ def test_in_charge_the_guard_is_ceres_rule(steps):
     ours = decades(config, memory, 0.3)
     np.testing.assert_allclose(ours, np.log10(2 * 1e-2), atol=1e-6)  # twice the lambda that failed last
     rule = Ceres(initial=10.0**ours)
-    state, damping = rule.init(info())
-    # Ceres' own growth for the next rejection after one at this lambda is already doubled
-    state = state._replace(growth=jnp.asarray(4.0))
+    _, damping = rule.init(info())
+    state = jnp.asarray(4.0)  # the growth of the next rejection after one at this lambda is already doubled
     for accepted, gain in steps:
         gain = gain if accepted else -gain
         step = step_info(accepted, gain, damping, cost=1.0, previous_cost=1.5 if accepted else 1.0, candidate_cost=2.0)

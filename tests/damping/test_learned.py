@@ -24,11 +24,12 @@ from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import Layer, LearnedPolicy, learned_from
-from jaxba.damping.policy_file import FORMAT, LARGEST_FILE, PolicyFileError, load_policy, save_policy
+from jaxba.damping.policy_file import FORMAT, LARGEST_FILE, load_policy, save_policy
 from jaxba.problem.options import Coordinates, Refinement
 from jaxba.solver.names import SolverName, parse_solver
 from jaxba.training import sac
 from jaxba.training.config import load
+from jaxba.typing import InputError
 
 AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
 
@@ -148,7 +149,7 @@ def test_a_file_that_is_no_policy_is_refused_in_one_line(tmp_path, case):
 
 def _refused(path: Path, words: str) -> None:
     for read in (load_policy, lambda path: make_policy(str(path))):
-        with pytest.raises(PolicyFileError, match=words) as caught:
+        with pytest.raises(InputError, match=words) as caught:
             read(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
@@ -185,7 +186,7 @@ def test_a_large_file_is_refused_in_one_line(tmp_path):
 
 
 def test_a_policy_that_could_not_be_read_again_is_not_written(tmp_path):
-    with pytest.raises(PolicyFileError, match="more than the 1048576 of a policy file"):
+    with pytest.raises(InputError, match="more than the 1048576 of a policy file"):
         save_policy(tmp_path / "large.safetensors", random_policy(0, width=512))
     assert not list(tmp_path.iterdir())
 

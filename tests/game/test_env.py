@@ -15,8 +15,7 @@ from support import same_bits
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
 from jaxba import StepOptions
-from jaxba.damping.clock import duration
-from jaxba.damping.features import begin, observation_size, observe
+from jaxba.damping.features import begin, duration, observation_size, observe
 from jaxba.damping.guard import damping_of
 from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
 from jaxba.game.protocol import Environment

@@ -30,7 +30,6 @@ from jaxba.game.statistics import paired_ratio
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step
 from jaxba.problem.options import Refinement
-from jaxba.structure.layout import partition_of
 
 LIMIT = 25
 
@@ -99,7 +98,7 @@ def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
 @pytest.mark.slow
 def test_scenes_of_a_class_share_random_clusters():
     bank, options = tiny_bank(), make_method("stba:2").options(StepOptions())
-    labels = partition_of(class_layout(KIND, options)).label
+    labels = class_layout(KIND, options).partitions.label
     assert labels.max() >= 1
     assert len(np.unique(labels, axis=0)) > 1
     found = play(KIND, bank, CERES, options, 12)

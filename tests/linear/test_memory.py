@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxba import Refinement, StepOptions, initial_state, lm_step, random_scene, scene_like
-from jaxba.solver.cost_model import BYTES_PER_OBSERVATION
-from jaxba.structure.layout import layout_for
+from jaxba import Refinement, StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
+from jaxba.solver.choose import BYTES_PER_OBSERVATION
 
 pytestmark = pytest.mark.xla
 
 
 def bytes_per_observation(problem, options, dtype):
-    layout = layout_for(problem, options)
+    layout = build_layout(problem, options)
     state = jax.eval_shape(lambda layout: initial_state(layout, problem, options, dtype), layout)
     damping = jax.ShapeDtypeStruct((), dtype)
     step = jax.jit(lambda layout, state, damping: lm_step(layout, state, damping, options))

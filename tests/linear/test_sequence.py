@@ -10,11 +10,10 @@ import pytest
 import support
 from support import start, step
 
-from jaxba import BundleProblem, StepOptions
+from jaxba import BundleProblem, StepOptions, build_layout
 from jaxba.problem.options import ConjugateGradients
 from jaxba.runtime.process import single_blas_thread
 from jaxba.scenes import SceneConfig, random_scene
-from jaxba.structure.layout import layout_for
 
 EXACT = StepOptions()
 UNTIL_NOTHING_CHANGES = ConjugateGradients(forcing=0.0, tolerance=1e-12, max_iterations=3000)
@@ -59,11 +58,11 @@ def taken(name: str, damping: float):
 
 
 def test_the_sequence_is_factored_as_a_band_and_has_several_clusters():
-    pairs = layout_for(sequence(), OPTIONS["explicit"]).pairs
+    pairs = build_layout(sequence(), OPTIONS["explicit"]).pairs
     assert pairs is not None
     assert pairs.band is not None
     assert pairs.table is None
-    clusters = layout_for(sequence(), OPTIONS["sparse"]).clusters
+    clusters = build_layout(sequence(), OPTIONS["sparse"]).clusters
     assert clusters is not None
     assert len(clusters.members) == 8
 

@@ -17,17 +17,15 @@ import support
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, Loss, StepOptions, initial_state
+from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state
 from jaxba.linear.preconditioners import diagonal_blocks, preconditioner
-from jaxba.linear.schur import RotationCoordinates, camera_system, eliminate_points
-from jaxba.linear.two_level import SIMILARITY, Anchor, camera_modes, cluster_sum, coarse_system
-from jaxba.model import camera
+from jaxba.linear.schur import DampedSystem
+from jaxba.linear.two_level import SIMILARITY, camera_modes, cluster_sum, coarse_system
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.runtime.compilation import compiler_options
 from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
-from jaxba.structure.layout import layout_for
 
 MODES = SIMILARITY + 3
 
@@ -107,20 +105,17 @@ def everything(layout, problem, damping, more, options: StepOptions):
     """Modes, coarse system, two-level preconditioner and diagonal blocks, with `more` added to the camera blocks."""
     state = initial_state(layout, problem, options, jnp.float64)
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, RotationCoordinates.of(state.cameras, options), damping, options)
-    system = system._replace(blocks=system.blocks + more)
-    frames = camera.frames(state.cameras)
-    anchor = Anchor(frames.rotation, frames.translation, state.points)
-    modes = camera_modes(layout, anchor, 9)
+    system = DampedSystem.of(layout, linear, state.cameras, state.points, damping, options)
+    system = system._replace(cameras=system.cameras._replace(blocks=system.cameras.blocks + more))
+    modes = camera_modes(layout, state.cameras, 9)
     rule = options.conjugate_gradients.preconditioner
-    apply = preconditioner(layout, linear, points, system, anchor, None, rule)
+    apply = preconditioner(system, None, rule)
     unit = jnp.eye(9 * layout.num_cameras).reshape(-1, layout.num_cameras, 9)
     return (
         modes,
-        coarse_system(layout, linear, points, system, anchor, modes),
+        coarse_system(system, modes),
         jax.vmap(apply)(unit).reshape(len(unit), -1).T,
-        diagonal_blocks(layout, linear, points, system),
+        diagonal_blocks(system),
     )
 
 
@@ -144,7 +139,7 @@ def make(name: str, more: float = 0.0) -> Case:
     problem = problem()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
-        layout = layout_for(problem, options)
+        layout = build_layout(problem, options)
     assert layout.clusters is not None
     added = np.zeros((problem.num_cameras, 9, 9))
     added[:, 6:, 6:] = more * (2 - np.eye(3))
@@ -215,7 +210,7 @@ def test_the_coarse_system_is_the_reduced_camera_system_between_the_modes(case):
 
 def test_clusters_sum_their_cameras():
     problem = support.odd()
-    layout = layout_for(problem, MANIFOLD)
+    layout = build_layout(problem, MANIFOLD)
     assert layout.clusters is not None
     rows = np.random.default_rng(0).normal(size=(problem.num_cameras, 4))
     expected = np.zeros((len(layout.clusters.members), 4))
@@ -225,8 +220,8 @@ def test_clusters_sum_their_cameras():
 
 def test_a_layout_without_clusters_is_refused():
     problem = support.tiny()
-    layout = layout_for(problem, replace(MANIFOLD, conjugate_gradients=ConjugateGradients("schur-jacobi")))
-    with pytest.raises(ValueError, match="clusters=True"):
+    layout = build_layout(problem, replace(MANIFOLD, conjugate_gradients=ConjugateGradients("schur-jacobi")))
+    with pytest.raises(ValueError, match="no clusters: build it with the options"):
         everything(layout, problem, jnp.asarray(0.1), np.zeros((6, 9, 9)), MANIFOLD)
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import support
 
-from jaxba import BundleProblem, Lenses, Loss, StepOptions, initial_state, lm_step, random_scene
+from jaxba import BundleProblem, Lenses, Loss, StepOptions, build_layout, initial_state, lm_step, random_scene
 from jaxba.linear.cholesky import lower_cholesky
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
 from jaxba.runtime.process import single_blas_thread
 from jaxba.scenes import SceneConfig
-from jaxba.structure.layout import Layout, build_layout, layout_for
+from jaxba.structure.layout import Layout
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import capacity_of, padded_parameters
 
@@ -66,11 +66,12 @@ def shared() -> BundleProblem:
 
 def padded(problem: BundleProblem, _: StepOptions) -> tuple[Layout, BundleProblem]:
     capacity = capacity_of(problem, ObservationOrder.of(problem))
-    return build_layout(problem, capacity=capacity), padded_parameters(problem, capacity)
+    cameras, points = padded_parameters(problem, capacity)
+    return build_layout(problem, capacity=capacity), problem.replace(cameras=cameras, points=points)
 
 
 def own_size(problem: BundleProblem, options: StepOptions) -> tuple[Layout, BundleProblem]:
-    return layout_for(problem, options), problem
+    return build_layout(problem, options), problem
 
 
 FACTORED = {
@@ -187,7 +188,7 @@ def test_nothing_is_nan_where_the_residuals_or_all_weights_are_zero(loss):
     """At zero residuals the step is zero, too; far beyond the scale of a loss most or all of the weights are."""
     problem = in_first_camera(support.tiny())
     exact = problem.replace(observations=geometry.project(problem))
-    pixels = jnp.asarray(layout_for(exact, PLAIN).pixels)
+    pixels = jnp.asarray(build_layout(exact, PLAIN).pixels)
     function, at = as_function(lambda: exact, StepOptions(loss=Loss(loss, 1.7)), own_size)
 
     @jax.jit

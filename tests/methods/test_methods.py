@@ -16,7 +16,7 @@ import support
 from support import DAMPINGS, bal_file, check_step, needs_data, solve, start, step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal
-from jaxba.linear.schur import RotationCoordinates, apply_reduced, camera_system, eliminate_points
+from jaxba.linear.schur import DampedSystem, apply_reduced
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
 from jaxba.methods.stba import (
@@ -31,8 +31,7 @@ from jaxba.methods.stba import (
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.methods import UnknownMethodError
-from jaxba.structure.layout import partition_of
+from jaxba.typing import InputError
 
 CLUSTERED = StepOptions(method=StochasticClusters(cluster_cameras=2))
 ONE_CLUSTER = StepOptions(method=StochasticClusters(cluster_cameras=100))
@@ -54,15 +53,13 @@ def systems(problem: BundleProblem, options: StepOptions, damping: float, iterat
     """Everything that a clustered step is made of."""
     layout, state = start(problem, options)
     layout = jax.tree.map(jnp.asarray, layout)
-    return layout, *_systems(layout, state, jnp.asarray(damping), options), partition_of(layout).at(iteration)
+    return _system(layout, state, jnp.asarray(damping), options), layout.part("partitions").at(iteration)
 
 
 @functools.partial(jax.jit, static_argnames=("options",))
-def _systems(layout, state, damping, options):
+def _system(layout, state, damping, options):
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, RotationCoordinates.of(state.cameras, options), damping, options)
-    return linear, points, system
+    return DampedSystem.of(layout, linear, state.cameras, state.points, damping, options)
 
 
 # STBA
@@ -91,10 +88,11 @@ def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
 def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a point together."""
     problem, options = support.tiny(), MANIFOLD
-    layout, linear, points, system, part = systems(problem, options, damping)
-    split = eliminate_replicas(layout, linear, jnp.asarray(damping), part, options)
-    right = split_right_hand_side(layout, linear, system, split)
-    found = solve_clusters(layout, linear, points._replace(projected=split[0]), system, right, part)
+    system, part = systems(problem, options, damping)
+    split = eliminate_replicas(system.layout, system.linear, jnp.asarray(damping), part, options)
+    right = split_right_hand_side(system.layout, system.linear, system.cameras, split)
+    parts = system._replace(points=system.points._replace(projected=split[0]))
+    found = solve_clusters(parts, right, part)
     truth = support.dense(pieces(problem, np.asarray(part.label)), options, damping)
     np.testing.assert_allclose(found.ravel(), truth.step[: found.size], rtol=1e-6, atol=1e-9)
 
@@ -120,32 +118,33 @@ def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_
     """In the norm of B the error, and in that of B^-1 the residual, falls by at least the spectral radius of
     `B^-1 (B - S)`, which is below one."""
     problem, options = support.tiny(), MANIFOLD
-    layout, linear, points, system, part = systems(problem, options, damping)
-    size = system.right.size
+    system, part = systems(problem, options, damping)
+    size = system.cameras.right.size
     basis = jnp.eye(size).reshape(size, -1, 9)
-    matrix = np.asarray(jax.vmap(lambda x: apply_reduced(layout, linear, points, system, x))(basis)).reshape(size, size)
+    matrix = np.asarray(jax.vmap(lambda x: apply_reduced(system, x))(basis)).reshape(size, size)
     own = np.zeros((size, size))
-    for camera, block in enumerate(np.asarray(system.blocks)):
+    for camera, block in enumerate(np.asarray(system.cameras.blocks)):
         own[9 * camera : 9 * camera + 9, 9 * camera : 9 * camera + 9] = block
     root = np.linalg.cholesky(own)
     inner = np.linalg.solve(root, np.linalg.solve(root, (own - matrix).T).T)
     radius = np.max(np.abs(np.linalg.eigvalsh((inner + inner.T) / 2)))
     assert radius < 1
-    exact = np.linalg.solve(matrix, np.asarray(system.right).ravel())
-    first = clustered_step(layout, linear, points, system, jnp.asarray(damping), part, options, repairs=0)
+    exact = np.linalg.solve(matrix, np.asarray(system.cameras.right).ravel())
+    first = clustered_step(system, part, options, repairs=0)
     error = lambda x: np.linalg.norm(root.T @ (np.asarray(x).ravel() - exact))
     residual = lambda x: np.linalg.norm(np.linalg.solve(root, matrix @ (np.asarray(x).ravel() - exact)))
     for norm, whole in ((error, np.linalg.norm(root.T @ exact)), (residual, residual(np.zeros(size)))):
         before = norm(first)
         assert before > 1e-6 * whole
         for rounds in (1, 2, 4, 8):
-            after = norm(richardson(layout, linear, points, system, first, rounds))
+            after = norm(richardson(system, first, rounds))
             assert after <= radius**rounds * before * (1 + 1e-6) + 1e-9 * before
 
 
 def test_agreed_gradients_equal_the_published_projection():
     """`g - H^T (H D^-1 H^T)^-1 H D^-1 g` with H taking differences to the first copy."""
-    layout, *_, part = systems(support.tiny(), CLUSTERED, 2.0)
+    system, part = systems(support.tiny(), CLUSTERED, 2.0)
+    layout = system.layout
     rng = np.random.default_rng(0)
     copies = part.levels[-1].shape[0]
     gradient, diagonal = rng.normal(size=(3, copies)), rng.uniform(0.1, 9, size=(3, copies))
@@ -166,8 +165,8 @@ def test_agreed_gradients_equal_the_published_projection():
 
 
 def test_copies_agree_from_lambda_one_on_and_not_before():
-    layout, linear, _, _, part = systems(support.tiny(), CLUSTERED, 1.0)
-    plain = lambda damping: eliminate_replicas(layout, linear, jnp.asarray(damping), part, CLUSTERED)
+    system, part = systems(support.tiny(), CLUSTERED, 1.0)
+    plain = lambda damping: eliminate_replicas(*system[:2], jnp.asarray(damping), part, CLUSTERED)
     below, above = plain(1 - 1e-9), plain(1.0)
     assert np.abs(np.stack(below[1]) - np.stack(above[1])).max() > 0.1
     np.testing.assert_allclose(np.stack(below[0][0]), np.stack(above[0][0]), rtol=1e-6)
@@ -246,7 +245,7 @@ def test_a_method_with_its_own_solver_takes_no_other():
 
 
 def test_an_unknown_method_is_named_with_the_known_ones():
-    with pytest.raises(UnknownMethodError, match="lm, stba, deeplm, poba"):
+    with pytest.raises(InputError, match="lm, stba, deeplm, poba"):
         solve(support.tiny(), method="magic")
 
 
@@ -262,7 +261,7 @@ def test_random_clusters_are_one_program_for_all_turns():
     problem = read_bal(bal_file("problem-49-7776-pre"))
     options = make_method("stba:16").options(StepOptions())
     layout, state = start(problem, options)
-    label = partition_of(layout).label
+    label = layout.part("partitions").label
     assert len(np.unique(label, axis=0)) > 10
     state, _ = step(layout, state, 1e-3, options, iteration=0)
     with CompileClock() as clock:

@@ -256,5 +256,5 @@ def test_a_masked_observation_is_exactly_zero_even_on_the_camera_plane():
     projection = camera.project(frame, jnp.asarray(points.T), jnp.zeros(2, bool))
     found = camera.derivatives(frame, projection)
     assert not np.any(projection.pixel)
-    assert not np.any(np.array(found.camera))
-    assert not np.any(np.array(found.point))
+    assert not np.any(np.array(found[0]))
+    assert not np.any(np.array(found[1]))

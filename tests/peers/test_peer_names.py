@@ -11,9 +11,10 @@ from jaxba import peers
 from jaxba.bench import run as bench_run
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run
-from jaxba.damping import LearnedPolicy, UnknownPolicyError
+from jaxba.damping import LearnedPolicy
 from jaxba.problem.options import StepOptions
-from jaxba.solver.names import PEERS, SolverName, SolverNameError, parse_solver
+from jaxba.solver.names import PEERS, SolverName, parse_solver
+from jaxba.typing import InputError
 
 
 @pytest.mark.parametrize(
@@ -40,27 +41,27 @@ def test_solver_names_of_other_libraries_are_parsed_and_printed(text, name, shor
 
 
 @pytest.mark.parametrize(
-    ("text", "error", "message"),
+    ("text", "message"),
     [
-        ("pyceres", SolverNameError, "known: dense, sparse, iterative"),
-        ("pyceres:", SolverNameError, "known: dense, sparse, iterative"),
-        ("pyceres:qr", SolverNameError, "unknown mode 'qr'"),
-        ("pyceres:qr+ceres", SolverNameError, "unknown mode 'qr'"),
-        ("pyceres:dense@float32", SolverNameError, "unknown mode 'dense@float32'"),
-        ("pyceres:iterative-inner", SolverNameError, "unknown mode 'iterative-inner'"),
-        ("pyceres:sparse-inner+ceres", SolverNameError, "inner iterations under its own rule alone"),
-        ("pyceres:dense+", SolverNameError, "is no solver"),
-        ("pyceres:dense+cerse", UnknownPolicyError, "unknown damping policy 'cerse'"),
-        ("pyceres:dense+ceres+refine", SolverNameError, "unknown method 'ceres'"),
-        ("pyceres:dense+stba+ceres", SolverNameError, "the form is pyceres:dense+policy[+refineK|+embedded]"),
-        ("pyceres:dense+ceres@float32", SolverNameError, "the form is pyceres:dense+policy[+refineK|+embedded]"),
-        ("pyceres:dense+pyceres:dense", SolverNameError, "the form is pyceres:dense+policy"),
-        ("pyceres:dense+pyceres:dense+ceres", SolverNameError, "the form is pyceres:dense+policy"),
-        ("lm+pyceres:dense", UnknownPolicyError, "unknown damping policy 'pyceres:dense'"),
+        ("pyceres", "known: dense, sparse, iterative"),
+        ("pyceres:", "known: dense, sparse, iterative"),
+        ("pyceres:qr", "unknown mode 'qr'"),
+        ("pyceres:qr+ceres", "unknown mode 'qr'"),
+        ("pyceres:dense@float32", "unknown mode 'dense@float32'"),
+        ("pyceres:iterative-inner", "unknown mode 'iterative-inner'"),
+        ("pyceres:sparse-inner+ceres", "inner iterations under its own rule alone"),
+        ("pyceres:dense+", "is no solver"),
+        ("pyceres:dense+cerse", "unknown damping policy 'cerse'"),
+        ("pyceres:dense+ceres+refine", "unknown method 'ceres'"),
+        ("pyceres:dense+stba+ceres", "the form is pyceres:dense+policy[+refineK|+embedded]"),
+        ("pyceres:dense+ceres@float32", "the form is pyceres:dense+policy[+refineK|+embedded]"),
+        ("pyceres:dense+pyceres:dense", "the form is pyceres:dense+policy"),
+        ("pyceres:dense+pyceres:dense+ceres", "the form is pyceres:dense+policy"),
+        ("lm+pyceres:dense", "unknown damping policy 'pyceres:dense'"),
     ],
 )
-def test_what_is_no_peer_is_one_clear_line(text, error, message):
-    with pytest.raises(error) as caught:
+def test_what_is_no_peer_is_one_clear_line(text, message):
+    with pytest.raises(InputError) as caught:
         parse_solver(text)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -88,7 +89,7 @@ def test_every_peer_says_what_brings_it():
 
 def test_without_its_library_a_peer_is_refused_before_anything_runs(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(peers, "find_spec", lambda name: None)
-    with pytest.raises(SolverNameError, match=r"needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
+    with pytest.raises(InputError, match=r"needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
         bench_run.plan(sources(["scene:tiny"]), ["classic", "pyceres:dense+classic"], 1)
     assert run(["scene:tiny", "--solvers", "classic,pyceres:dense", "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err

@@ -29,7 +29,6 @@ from jaxba.cli.solve import run
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
-from jaxba.structure.layout import layout_for
 
 INDEX = np.array([0, 1, 0, 2, 1, 0])
 FREE = np.array([[1, 1, 0], [1, 1, 1], [0, 0, 0]], bool)
@@ -251,7 +250,7 @@ def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lens
 def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common():
     scene = random_scene(SceneConfig(cameras=64, points=300, mean_track=5.0), seed=0)
     problem = with_lenses(scene, np.arange(64) % 2, np.ones((2, 3), bool))
-    layout = layout_for(problem, StepOptions(linear_solver="implicit"))
+    layout = build_layout(problem, StepOptions(linear_solver="implicit"))
     assert layout.clusters is not None
     assert layout.clusters.lenses.several
     of_cluster = np.asarray(layout.clusters.lenses.members)[np.asarray(layout.clusters.label)]
@@ -296,7 +295,7 @@ def test_other_types_end_at_the_cost_of_float64_and_hold_what_is_held(dtype):
 def test_fixed_intrinsics_are_no_unknowns_and_leave_a_band_a_band():
     scene = random_scene(SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0)
     one = with_lenses(scene, np.zeros(100, int), np.ones((1, 3), bool))
-    layout = layout_for(one, StepOptions(intrinsics="fixed"))
+    layout = build_layout(one, StepOptions(intrinsics="fixed"))
     assert not layout.unknowns.shared
     assert layout.pairs is not None
     assert layout.pairs.band is not None

@@ -24,13 +24,19 @@ from jaxba.lm.damped_step import solve_step
 from jaxba.model.linearize import cost, linearize
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates, Refinement
-from jaxba.refinement import camera_rounds
+from jaxba.refinement import candidates
 from jaxba.refinement.acceptance import NEGLIGIBLE, comparison
-from jaxba.refinement.backtracking import SHORTER
-from jaxba.refinement.camera_rounds import GOOD_GAIN, MAX_COST_RATIO, MIN_GAINS, ROUNDS_OF_LATER_CANDIDATES
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
-from jaxba.refinement.candidates import best_candidate
-from jaxba.refinement.pattern_move import GAIN_TOLERANCE, SMALL_DAMPING_FRACTION
+from jaxba.refinement.candidates import (
+    GAIN_TOLERANCE,
+    GOOD_GAIN,
+    MAX_COST_RATIO,
+    MIN_GAINS,
+    ROUNDS_OF_LATER_CANDIDATES,
+    SHORTER,
+    SMALL_DAMPING_FRACTION,
+    best_candidate,
+)
 
 pytestmark = pytest.mark.step
 
@@ -308,10 +314,10 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
 def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatch):
     """What one round and two leave shows who is to have the next; limits in the middle of these, so that some are."""
     scenes = wide()
-    monkeypatch.setattr(camera_rounds, "MAX_COST_RATIO", np.inf)
+    monkeypatch.setattr(candidates, "MAX_COST_RATIO", np.inf)
 
     def repaired(rounds: int, *limits: float) -> tuple[np.ndarray, np.ndarray]:
-        monkeypatch.setattr(camera_rounds, "MIN_GAINS", limits)
+        monkeypatch.setattr(candidates, "MIN_GAINS", limits)
         options = StepOptions(refinement=Refinement(camera_rounds=rounds))
         once = jax.jit(lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1])
         infos = [once(*scene) for scene in scenes]

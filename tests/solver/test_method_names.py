@@ -11,6 +11,7 @@ from jaxba import METHODS, Refinement, SolveOptions, StepOptions, make_method, m
 from jaxba.methods.poba import PowerSeries
 from jaxba.solver import methods
 from jaxba.training.config import MethodName
+from jaxba.typing import InputError
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -28,7 +29,7 @@ def test_a_package_adds_a_method_by_an_entry_point(monkeypatch):
     monkeypatch.setattr(methods, "entry_points", lambda group: [added] if group == methods.GROUP else [])
     monkeypatch.setattr(methods, "METHODS", type(METHODS)())
     assert make_method("mine") == PowerSeries()
-    with pytest.raises(methods.UnknownMethodError, match="known: lm, stba, deeplm, poba, mine"):
+    with pytest.raises(InputError, match="known: lm, stba, deeplm, poba, mine"):
         make_method("yours")
 
 

@@ -28,8 +28,7 @@ from jaxba.lm.termination import Tolerances
 from jaxba.problem import geometry
 from jaxba.problem.options import StepOptions
 from jaxba.solver.prepare import set_up
-from jaxba.solver.sharded import _run
-from jaxba.structure.shards import deal_points, shard_of, sharded_layout
+from jaxba.solver.sharded import _run, deal_points, shard_of, sharded_layout
 
 DEVICES = 3
 """Of the tests (conftest.py): a number that divides little."""

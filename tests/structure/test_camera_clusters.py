@@ -13,7 +13,6 @@ from jaxba import BundleProblem, ConjugateGradients, Layout, StepOptions, build_
 from jaxba.structure import agglomeration, camera_clusters
 from jaxba.structure.agglomeration import agglomerate, shared_points
 from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout
-from jaxba.structure.layout import layout_for
 
 sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))  # cameras, points, seed
 
@@ -122,7 +121,7 @@ def test_what_nothing_connects_is_thrown_together_until_there_are_few_enough():
 def test_one_camera_is_one_cluster():
     assert np.array_equal(agglomerate(csr_matrix((1, 1)), 1, 1), [0])
     problem = support.single()
-    found = clusters_of(build_layout(problem, clusters=True))
+    found = clusters_of(build_layout(problem, StepOptions(linear_solver="sparse")))
     assert np.array_equal(found.label, [0])
     assert np.array_equal(found.members, [[0]])
 
@@ -153,7 +152,7 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
     problem = problem_of(*size, duplicates=duplicates)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
-        layout = build_layout(problem, clusters=True)
+        layout = build_layout(problem, StepOptions(linear_solver="sparse"))
     found, cameras = clusters_of(layout), problem.num_cameras
     count = len(found.members)
     assert count == max(1, cameras // cluster_cameras)
@@ -187,13 +186,13 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
 
 def test_there_are_never_more_clusters_than_the_limit(monkeypatch):
     monkeypatch.setattr(camera_clusters, "MAX_CLUSTERS", 2)
-    found = clusters_of(build_layout(problem_of(30, 25, 0), clusters=True))
+    found = clusters_of(build_layout(problem_of(30, 25, 0), StepOptions(linear_solver="sparse")))
     assert len(found.members) == 2
 
 
 def test_clusters_are_made_only_where_the_two_level_preconditioner_is_asked_for():
     problem = support.tiny()
-    made = lambda **changes: layout_for(problem, StepOptions(**changes)).clusters is not None
+    made = lambda **changes: build_layout(problem, StepOptions(**changes)).clusters is not None
     assert made(linear_solver="sparse")
     assert made(linear_solver="implicit")
     assert not made(linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi"))

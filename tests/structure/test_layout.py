@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from jaxba import BundleProblem, Layout, build_layout
 from jaxba.structure import covisibility
-from jaxba.structure.layout import CAMERA_CHUNK
+from jaxba.structure.layout import CAMERA_CHUNK, NO_SYSTEM
 from jaxba.structure.sum_trees import TREE_WIDTH, fitting_width, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import MAX_PADDING, TILE, TILED_POINTS
 
@@ -91,7 +91,7 @@ def rows_of_problem(problem: BundleProblem) -> Counter:
 @given(tracks_and_cameras, st.integers(0, 3))
 def test_every_observation_is_in_exactly_one_slot(case, duplicates):
     problem = problem_of(*case, seed=0, duplicates=duplicates)
-    layout = build_layout(problem, pairs=False)
+    layout = build_layout(problem, NO_SYSTEM)
     assert rows_of(layout) == rows_of_problem(problem)
     empty = ~np.asarray(layout.slot_mask)
     assert empty.any()
@@ -109,7 +109,7 @@ def test_every_observation_is_in_exactly_one_slot(case, duplicates):
 @given(tracks_and_cameras)
 def test_at_most_a_tenth_is_padding_whatever_the_track_lengths(case):
     problem = problem_of(*case, seed=0)
-    layout = build_layout(problem, pairs=False)
+    layout = build_layout(problem, NO_SYSTEM)
     spare = layout.buckets[0][1]  # the one point of padding that is always there
     assert layout.num_slots - spare <= (1 + MAX_PADDING) * problem.num_observations
 
@@ -117,7 +117,7 @@ def test_at_most_a_tenth_is_padding_whatever_the_track_lengths(case):
 def test_tiles_stay_within_that_tenth():
     """Many lengths, each with hardly more points than make a bucket one of tiles."""
     problem = problem_of(np.repeat(np.arange(2, 30), TILED_POINTS + 1), 40, seed=0)
-    layout = build_layout(problem, pairs=False)
+    layout = build_layout(problem, NO_SYSTEM)
     assert any(tile == TILE for _, _, tile in layout.buckets)
     assert layout.num_slots - layout.buckets[0][1] <= (1 + MAX_PADDING) * problem.num_observations
 
@@ -126,7 +126,7 @@ def test_tiles_stay_within_that_tenth():
 def test_long_tails_need_few_buckets(longest):
     """Every bucket costs compilation: a smooth distribution of lengths up to hundreds needs a dozen or two."""
     lengths = np.clip((np.random.default_rng(0).pareto(1.2, 4000) * 2 + 2).astype(int), 2, longest)
-    layout = build_layout(problem_of(lengths, longest, seed=1), pairs=False)
+    layout = build_layout(problem_of(lengths, longest, seed=1), NO_SYSTEM)
     assert len(layout.buckets) <= 25
     assert layout.num_slots <= (1 + MAX_PADDING) * lengths.sum() + layout.buckets[0][1]
 
@@ -159,7 +159,7 @@ def test_one_observation_is_enough():
 def test_a_large_bucket_is_cut_into_tiles(length):
     """With slots of a tile side by side, a point of padding or more at its end, and every sum as it was."""
     problem = problem_of(np.full(3 * TILED_POINTS, length), 9, seed=1)
-    layout = build_layout(problem, pairs=False)
+    layout = build_layout(problem, NO_SYSTEM)
     assert layout.buckets == ((3 * TILED_POINTS // TILE + 1, length, TILE),)
     assert rows_of(layout) == rows_of_problem(problem)
     of_tile = np.asarray(layout.slot_point).reshape(-1, length, TILE)
@@ -226,7 +226,7 @@ def test_point_and_camera_sums_equal_add_at(make):
 def test_points_of_long_and_short_tracks_in_tiles_and_out_of_them_are_summed():
     long = 32
     lengths = np.repeat([3, long, 2 * long], [TILED_POINTS + 5, 300, 200])
-    layout = build_layout(problem_of(lengths, 70, seed=2), pairs=False)
+    layout = build_layout(problem_of(lengths, 70, seed=2), NO_SYSTEM)
     shapes = [(tile == TILE, length > long) for _, length, tile in layout.buckets]
     assert (True, False) in shapes
     assert (False, True) in shapes
@@ -235,7 +235,7 @@ def test_points_of_long_and_short_tracks_in_tiles_and_out_of_them_are_summed():
 
 
 def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():
-    layout = build_layout(problem_of(np.full(5000, 2), 3, seed=2), pairs=False)
+    layout = build_layout(problem_of(np.full(5000, 2), 3, seed=2), NO_SYSTEM)
     assert layout.camera_levels[0].shape[1] == CAMERA_CHUNK
     values = np.where(layout.slot_mask, 1, 0)
     assert sum_by_levels(values, layout.camera_levels).sum() == 10000
@@ -273,16 +273,14 @@ def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.nd
     st.integers(1, 25),
     st.integers(0, 6),
     st.sampled_from([2, 7, 2048]),
-    st.sampled_from([0, covisibility.MAX_COUNTED_BLOCKS]),
 )
-def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch, counted):
+def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch):
     """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
     rng = np.random.default_rng(seed)
     tracks = np.append(1, rng.integers(0, cameras + 1, points))
     problem = problem_of(tracks, cameras, seed, duplicates)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(covisibility, "PAIR_BATCH", batch)
-        patch.setattr(covisibility, "MAX_COUNTED_BLOCKS", counted)
         layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
@@ -307,7 +305,7 @@ def test_diagonal_blocks_know_their_camera_and_the_others_know_they_have_none():
 
 
 def test_pairs_are_listed_only_on_demand():
-    assert build_layout(support.tiny(), pairs=False).pairs is None
+    assert build_layout(support.tiny(), NO_SYSTEM).pairs is None
 
 
 def test_a_grid_names_the_slot_of_every_view_and_an_empty_one_elsewhere():

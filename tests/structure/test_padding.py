@@ -28,15 +28,15 @@ from jaxba import (
     StepOptions,
     Tolerances,
     build_layout,
-    initial_state,
     random_scene,
     solve_loop,
 )
+from jaxba.lm.step import state_of
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem.options import Refinement
 from jaxba.scenes import SceneConfig
 from jaxba.structure import covisibility
-from jaxba.structure.layout import layout_for
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import (
     MAX_CAMERAS,
     MAX_PAIRS,
@@ -137,8 +137,10 @@ def test_a_capacity_holds_its_problem_and_no_more_than_the_next_size(seed, camer
     layout = build_layout(problem, grid=False)
     seen = support.by_camera(layout, layout.slot_mask)
     listed = np.sum(seen[layout.pairs.left] & seen[layout.pairs.right])
-    assert found.holds(problem)
-    assert not replace(found, observations=found.observations * 8 // 9).holds(problem) or found.observations == 1024
+    order = ObservationOrder.of(problem)
+    assert found.holds(order)
+    smaller = replace(found, observations=found.observations * 8 // 9)
+    assert not smaller.holds(order) or found.observations == 1024
     rooms = [int(share * found.observations / POINT_CHUNK) for share in POINTS_PER_CHUNK]
     assert found.points == min(room for room in rooms if room >= problem.num_points)
     least = found.observations * PAIRS_PER_SLOT
@@ -249,10 +251,9 @@ def test_windows_of_a_sequence_share_shapes_wherever_they_share_a_cell():
     seen: dict = {}
     for problem in windows(31):
         capacity = capacity_of(problem)
-        layout = layout_for(problem, StepOptions(), capacity)
-        state = jax.eval_shape(
-            lambda p, layout=layout: initial_state(layout, p, StepOptions()), padded_parameters(problem, capacity)
-        )
+        layout = build_layout(problem, StepOptions(), capacity)
+        start = padded_parameters(problem, capacity)
+        state = jax.eval_shape(lambda *start, layout=layout: state_of(layout, *start, StepOptions()), *start)
         seen.setdefault((capacity, layout.grid is None), []).append(shapes((layout, state)))
     assert all(made == same[0] for same in seen.values() for made in same)
     assert len(seen) <= 6
@@ -290,10 +291,10 @@ def test_a_problem_larger_than_the_capacity_is_refused():
         build_layout(problem, capacity=SMALL)
 
 
-@pytest.mark.parametrize("parts", [{"clusters": True}, {"factor": False}, {"factor": False, "partitions": 3}])
-def test_only_layouts_for_a_factored_system_are_padded(parts):
+@pytest.mark.parametrize("solver", ["implicit", "sparse"])
+def test_only_layouts_for_a_factored_system_are_padded(solver):
     with pytest.raises(ValueError, match="only layouts for a factored system"):
-        build_layout(support.tiny(), capacity=SMALL, **parts)
+        build_layout(support.tiny(), StepOptions(linear_solver=solver), SMALL)
 
 
 # Solves
@@ -344,7 +345,7 @@ def test_policies_see_the_true_problem(policy):
 def test_a_band_is_factored_dense_to_the_same_end():
     scene = random_scene(SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
     padded, plain = (stepwise(scene, max_iterations=4, pad=pad) for pad in (True, False))
-    assert layout_for(scene, StepOptions()).pairs.band is not None
+    assert build_layout(scene, StepOptions()).pairs.band is not None
     check_same(padded, plain)
 
 
@@ -395,8 +396,8 @@ def test_a_program_is_the_same_text_for_every_problem_of_a_cell():
     texts = set()
     for problem in mates(dense=False):
         capacity = capacity_of(problem)
-        layout = layout_for(problem, StepOptions(), capacity)
-        state = initial_state(layout, padded_parameters(problem, capacity), StepOptions())
+        layout = build_layout(problem, StepOptions(), capacity)
+        state = state_of(layout, *padded_parameters(problem, capacity), StepOptions())
         texts.add(solve_loop.__wrapped__.lower(layout, state, Ceres(), Tolerances(), StepOptions(), 10).as_text())
     assert len(texts) == 1
 

@@ -14,9 +14,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from support import bal_file, needs_data
 
-from jaxba import BundleProblem, StepOptions, read_bal
+from jaxba import BundleProblem, StepOptions, build_layout, read_bal
 from jaxba.methods.stba import StochasticClusters
-from jaxba.structure.layout import build_layout, layout_for, partition_of
 from jaxba.structure.louvain import camera_graph, cluster, clusterings
 from jaxba.structure.random_partitions import PARTITIONS
 from jaxba.structure.segment_sums import tree_sum
@@ -112,8 +111,8 @@ def test_better_communities_are_more_likely():
 @given(st.tuples(st.integers(2, 20), st.integers(1, 40), st.integers(0, 99)), st.integers(1, 8))
 def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
     problem = observed(*size)
-    layout = build_layout(problem, factor=False, partitions=largest)
-    partitions = partition_of(layout)
+    layout = build_layout(problem, StepOptions(method=StochasticClusters(largest)))
+    partitions = layout.part("partitions")
     values = np.random.default_rng(0).normal(size=layout.num_slots) * layout.slot_mask
     for turn in range(len(partitions.label)):
         part = partitions.at(turn)
@@ -134,22 +133,20 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
 
 
 def test_small_problems_have_one_partition_with_one_cluster():
-    partitions = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters())))
+    partitions = build_layout(support.tiny(), StepOptions(method=StochasticClusters())).partitions
     assert partitions.label.shape == (1, 6)
-    many = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))))
+    many = build_layout(support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))).partitions
     assert many.label.shape == (PARTITIONS, 6)
 
 
 def test_a_layout_without_partitions_says_how_to_get_them():
-    with pytest.raises(ValueError, match="partitions="):
-        partition_of(build_layout(support.tiny()))
-    with pytest.raises(ValueError, match="pairs=True"):
-        build_layout(support.tiny(), pairs=False, partitions=3)
+    with pytest.raises(ValueError, match="no partitions: build it with the options of the step"):
+        build_layout(support.tiny()).part("partitions")
 
 
 @needs_data
 def test_no_cluster_of_a_real_problem_is_larger_than_asked():
     problem = read_bal(bal_file("problem-49-7776-pre"))
-    partitions = partition_of(layout_for(problem, StepOptions(method=StochasticClusters(cluster_cameras=16))))
+    partitions = build_layout(problem, StepOptions(method=StochasticClusters(cluster_cameras=16))).partitions
     assert partitions.members.shape[2] <= 16
     assert 3 <= partitions.members.shape[1] <= 12

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from jaxba.damping import Schedule
-from jaxba.damping.clock import DURATIONS
+from jaxba.damping.features import DURATIONS
 from jaxba.paper import agents, real_problems
 from jaxba.paper.claims import Statement, order_claim, ratio_claim, success_claim
 from jaxba.paper.config import PAPER_STATE
@@ -160,9 +160,9 @@ TABLES = (
         lambda _: (
             "An iteration of the compiled game has no duration of its own. The clock gives it one of "
             f"{len(DURATIONS)} quantiles of measured durations, {min(DURATIONS):g} to {max(DURATIONS):g} of their mean "
-            f"(`jaxba/damping/clock.py`), and the mean is the paper's on BAL, {agents.SECONDS:g} s, against a bonus of "
-            "10. The agent of the other ablations has the constant reward. The shrinking bonus loses 1 % of its first "
-            "value in each iteration."
+            f"(`jaxba/damping/features.py`), and the mean is the paper's on BAL, {agents.SECONDS:g} s, against a bonus "
+            "of 10. The agent of the other ablations has the constant reward. The shrinking bonus loses 1 % of its "
+            "first value in each iteration."
         ),
     ),
     _ablation(

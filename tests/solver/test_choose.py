@@ -15,9 +15,9 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from jaxba import BundleProblem, ProblemError, build_layout
 from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
-from jaxba.solver import choose, cost_model
-from jaxba.solver.choose import choose_linear_solver
-from jaxba.solver.cost_model import count_pairs, predict
+from jaxba.solver import choose
+from jaxba.solver.choose import choose_linear_solver, count_pairs, predict
+from jaxba.structure.observation_order import ObservationOrder
 
 SEQUENCE = SceneConfig(
     cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
@@ -63,7 +63,7 @@ def test_pairs_blocks_and_reach_are_those_of_brute_force(cameras, points, seed, 
     row, column = np.nonzero(shared)
     rank = np.argsort(reverse_cuthill_mckee(csr_matrix(shared), symmetric_mode=True))
     reach = min(np.abs(row - column).max(initial=0), np.abs(rank[row] - rank[column]).max(initial=0))
-    assert count_pairs(problem) == (pairs, np.tril(shared).sum(), reach)
+    assert count_pairs(ObservationOrder.of(problem)) == (pairs, np.tril(shared).sum(), reach)
 
 
 def test_the_counted_reach_is_that_of_the_layout():
@@ -73,15 +73,15 @@ def test_the_counted_reach_is_that_of_the_layout():
     assert pairs is not None
     assert pairs.band is not None
     _, tile, columns = pairs.band.blocks.shape
-    assert columns == tile * (1 + -(-count_pairs(problem).bandwidth // tile))
+    assert columns == tile * (1 + -(-count_pairs(ObservationOrder.of(problem)).bandwidth // tile))
 
 
 @pytest.mark.parametrize("limit", ["MAX_COUNTED_PAIRS", "MAX_COUNTED_CAMERAS"])
 def test_what_is_not_counted_is_bounded_from_above(monkeypatch, limit):
     problem = random_scene(SEQUENCE, 0)
-    exact = count_pairs(problem)
-    monkeypatch.setattr("jaxba.solver.cost_model." + limit, 10)
-    bound = count_pairs(problem)
+    exact = count_pairs(ObservationOrder.of(problem))
+    monkeypatch.setattr("jaxba.solver.choose." + limit, 10)
+    bound = count_pairs(ObservationOrder.of(problem))
     assert bound.pairs == exact.pairs
     assert exact.blocks < bound.blocks <= 300 * 301 // 2
     assert exact.bandwidth < bound.bandwidth == 300
@@ -94,14 +94,14 @@ def test_a_banded_sequence_of_hundreds_of_cameras_is_factored():
     problem = random_scene(SEQUENCE, 0)
     assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
     costs = predict(problem)
-    assert 0 < costs.explicit < min(costs.sparse, costs.implicit)
+    assert 0 < costs["explicit"] < min(costs["sparse"], costs["implicit"])
 
 
 def test_the_band_of_a_sequence_is_found_in_any_numbering():
     """Not quite the narrowest: finding that is a hard problem."""
     problem = random_scene(SEQUENCE, 0)
     for seed in range(3):
-        assert predict(renumbered(problem, seed)).explicit < 2 * predict(problem).explicit
+        assert predict(renumbered(problem, seed))["explicit"] < 2 * predict(problem)["explicit"]
 
 
 def test_a_system_of_hundreds_of_cameras_without_a_band_is_not_factored():
@@ -109,8 +109,8 @@ def test_a_system_of_hundreds_of_cameras_without_a_band_is_not_factored():
     problem = random_scene(SEQUENCE, 0)
     rng = np.random.default_rng(0)
     anywhere = problem.replace(camera_index=rng.integers(300, size=problem.num_observations).astype(np.int32))
-    assert count_pairs(anywhere).bandwidth > 200
-    assert predict(anywhere).explicit > 5 * predict(problem).explicit
+    assert count_pairs(ObservationOrder.of(anywhere)).bandwidth > 200
+    assert predict(anywhere)["explicit"] > 5 * predict(problem)["explicit"]
     assert choose_linear_solver(anywhere, StepOptions(), "auto").linear_solver != "explicit"
 
 
@@ -122,12 +122,12 @@ def test_a_few_cameras_are_factored():
 def test_many_cameras_that_see_few_points_are_factored_by_way_of_the_points():
     """As with the corners of a calibration board; without that way 2700 unknowns would be factored."""
     board = problem_of(300, 20, 0)
-    assert predict(board).explicit < min(predict(board).sparse, predict(board).implicit)
+    assert predict(board)["explicit"] < min(predict(board)["sparse"], predict(board)["implicit"])
     assert choose_linear_solver(board, StepOptions(), "auto").linear_solver == "explicit"
     assert build_layout(board).grid is not None
     twice = problem_of(300, 20, 0, duplicates=1)
     assert build_layout(twice).grid is None
-    assert predict(twice).explicit > 100 * predict(board).explicit
+    assert predict(twice)["explicit"] > 100 * predict(board)["explicit"]
 
 
 def test_a_factorisation_beyond_the_machine_is_refused_where_there_is_no_choice(monkeypatch):
@@ -143,15 +143,15 @@ def test_a_factorisation_beyond_the_machine_is_refused_where_there_is_no_choice(
 
 def test_a_solver_without_the_memory_for_it_is_not_chosen(monkeypatch):
     problem = random_scene(SEQUENCE, 0)
-    monkeypatch.setattr("jaxba.solver.cost_model.MAX_BYTES", 1e6)
+    monkeypatch.setattr("jaxba.solver.choose.MAX_BYTES", 1e6)
     costs = predict(problem)
-    assert costs.explicit == costs.sparse == np.inf
+    assert costs["explicit"] == costs["sparse"] == np.inf
     assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "implicit"
 
 
 def test_observations_that_a_gpu_cannot_hold_are_refused_with_the_arithmetic(monkeypatch):
     problem = problem_of(20, 60, 0)
-    needed = 0.5 * cost_model.BYTES_PER_OBSERVATION * problem.num_observations
+    needed = 0.5 * choose.BYTES_PER_OBSERVATION * problem.num_observations
     monkeypatch.setattr(choose, "device_memory", lambda: needed + 1)
     choose_linear_solver(problem, StepOptions(), "auto")
     monkeypatch.setattr(choose, "device_memory", lambda: needed - 1)
