@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import jaxba
 from jaxba.cli.solve import run
@@ -21,6 +22,7 @@ STREET = jaxba.SceneConfig(
 """The start is the truth, and the camera looks ahead."""
 
 
+@pytest.mark.slow
 def test_the_recipe_for_kitti_keeps_a_path_that_is_right(tmp_path):
     street = jaxba.random_scene(STREET, 1)
     jaxba.write_bal(street, tmp_path / "start.txt")

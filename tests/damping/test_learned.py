@@ -352,6 +352,7 @@ def scene(seed: int):
     return random_scene(scene_like("paper"), seed)
 
 
+@pytest.mark.slow
 def test_another_policy_of_the_same_shape_compiles_nothing():
     solve(scene(0), random_policy(1), max_iterations=40)
     programs = solve_loop.__wrapped__._cache_size()

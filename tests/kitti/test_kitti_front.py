@@ -117,7 +117,7 @@ def test_a_blank_image_has_no_key_points():
 # The whole command
 
 
-@pytest.mark.parametrize("camera", [SMALL, OTHER])
+@pytest.mark.parametrize("camera", [SMALL, pytest.param(OTHER, marks=pytest.mark.slow)])
 def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera):
     out = tmp_path / "problem.txt.bz2"
     assert build(rendered[camera], out) == 0
@@ -372,6 +372,7 @@ def test_an_error_that_is_not_finite_is_said_in_one_line(rendered, tmp_path, cap
 # Real frames
 
 
+@pytest.mark.slow
 @needs_data
 def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys):
     """Frames 0 to 19 of sequence 00: 16 m of nearly straight road."""

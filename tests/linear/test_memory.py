@@ -23,7 +23,9 @@ def bytes_per_observation(problem, options, dtype):
     return total / problem.num_observations
 
 
-@pytest.mark.parametrize(("dtype", "share", "refine"), [(jnp.float64, 1.0, 3), (jnp.float32, 0.55, 0)])
+@pytest.mark.parametrize(
+    ("dtype", "share", "refine"), [(jnp.float64, 1.0, 3), pytest.param(jnp.float32, 0.55, 0, marks=pytest.mark.slow)]
+)
 def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, share, refine):
     problem = random_scene(scene_like("random-150"), 0)
     used = bytes_per_observation(

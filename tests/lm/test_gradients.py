@@ -148,18 +148,15 @@ def check_forward(function, at, width: float = 3e-7) -> None:
             assert error <= 1e-5 * size + 4 * rounding[name] / width, (name, error, size, rounding[name] / width)
 
 
-def some_slow(names, fast) -> list:
-    """All names, those that are not `fast` as slow tests."""
-    return [pytest.param(name, marks=() if name in fast else pytest.mark.slow) for name in names]
-
-
-@pytest.mark.parametrize("name", some_slow([*FACTORED, *WITH_LOOPS], ("tukey",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*FACTORED, *WITH_LOOPS])
 def test_forward_derivatives_are_finite_and_those_of_differences(name):
     check_forward(*as_function(*{**FACTORED, **WITH_LOOPS}[name]))
 
 
 # backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of each
-@pytest.mark.parametrize("name", some_slow(["dense", "shared-lenses", "cg"], ()))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dense", "shared-lenses", "cg"])
 def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(name):
     function, at = as_function(*FACTORED[name])
     rng = np.random.default_rng(1)
@@ -183,7 +180,8 @@ def test_the_jacobian_is_made_of_forward_derivatives():
     np.testing.assert_allclose(jacobian, gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
-@pytest.mark.parametrize("loss", some_slow(["squared", "tukey"], ()))
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["squared", "tukey"])
 def test_nothing_is_nan_where_the_residuals_or_all_weights_are_zero(loss):
     """At zero residuals the step is zero, too; far beyond the scale of a loss most or all of the weights are."""
     problem = in_first_camera(support.tiny())

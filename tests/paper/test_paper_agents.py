@@ -91,6 +91,7 @@ def test_the_scenes_of_the_tables_are_not_used_in_training(split, monkeypatch, t
     assert costs[0] | costs[1] == set(np.asarray(split.train.initial_cost).tolist())
 
 
+@pytest.mark.slow
 def test_the_agent_with_few_scenes_trains_on_the_first_ones(split):
     few = PaperConfig(agents=AgentsConfig(trajectories=3))
     wanted = agents.train_config(few, agents.FEW, 0)

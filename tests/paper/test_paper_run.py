@@ -111,6 +111,7 @@ def test_a_second_call_computes_nothing(finished, settings, capsys):
     assert (finished / PLAYS).read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, 2])
 def test_only_a_missing_record_is_computed_again(finished, settings, capsys, lost, monkeypatch):
     monkeypatch.setattr(rollout, "LANES", groups.GROUP)

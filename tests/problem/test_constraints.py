@@ -49,7 +49,9 @@ def constant_numbers(problem: BundleProblem) -> np.ndarray:
     return np.concatenate([cameras.ravel(), np.repeat(problem.constants.points, 3)])
 
 
-@pytest.mark.parametrize("solver", ["explicit", "sparse", "implicit", "poba"])
+@pytest.mark.parametrize(
+    "solver", ["explicit", "implicit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sparse", "poba"))]
+)
 def test_a_step_is_that_of_the_dense_problem_without_the_columns_of_constants(solver):
     problem = held()
     options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT) if solver != "poba" else StepOptions()
@@ -248,7 +250,9 @@ def test_priors_that_do_not_fit_are_refused_in_one_line():
         BundleProblem.create(*parts, priors=replace(priors, lens_weight=priors.lens_weight * np.nan))
 
 
-@pytest.mark.parametrize(("policy", "solver"), [("ceres", "explicit"), ("guarded", "implicit")])
+@pytest.mark.parametrize(
+    ("policy", "solver"), [("ceres", "explicit"), pytest.param("guarded", "implicit", marks=pytest.mark.slow)]
+)
 def test_scipy_finds_nothing_below_the_end_of_a_solve_with_priors(policy, solver):
     problem = known()
     solution = solve(problem, policy, SolveOptions(linear_solver=solver, max_iterations=200))

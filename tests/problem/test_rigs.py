@@ -192,7 +192,7 @@ def test_cameras_of_a_frame_stay_where_their_rig_has_them(policy):
     np.testing.assert_allclose(after.cameras[[1, 4], :6], problem.cameras[[1, 4], :6], rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("make", [rigged, stereo])
+@pytest.mark.parametrize("make", [rigged, pytest.param(stereo, marks=pytest.mark.slow)])
 def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera(make):
     problem = with_gauge(solve(make(), "ceres").problem, "two-cameras")
     # constant places in rigs give the scene its scale

@@ -138,6 +138,7 @@ def test_shared_lenses_stay_equal_bit_by_bit():
     assert (lens[0] != cameras[0, 6:]).all()
 
 
+@pytest.mark.slow
 def test_without_a_change_of_focal_length_nothing_differs():
     cameras, step = random_step(5, 0.1)
     step[6] = 0

@@ -80,7 +80,10 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
 @pytest.mark.xla
 @pytest.mark.parametrize(
     "how",
-    [{"compilation": "full"}, {"compilation": "quick", "dtype": "float32"}],
+    [
+        pytest.param({"compilation": "full"}, marks=pytest.mark.slow),
+        {"compilation": "quick", "dtype": "float32"},
+    ],
     ids=str,
 )
 def test_every_program_is_compiled_once_before_the_first_iteration(how):
@@ -109,6 +112,7 @@ def test_the_two_parts_are_the_step():
     chex.assert_trees_all_close(parts, whole, rtol=1e-9, atol=1e-12)  # rounding, divided by lambda
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["quick"])
 def test_candidates_one_by_one_are_those_of_the_loop(level):
     layout, state = support.start(support.tiny())

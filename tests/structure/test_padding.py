@@ -313,7 +313,7 @@ def check_same(padded, plain, rtol: float = 1e-9) -> None:
     np.testing.assert_allclose(padded.problem.points, plain.problem.points, rtol=1e-5, atol=1e-6)
 
 
-SLOW_KINDS = ("tiny", "loss", "fixed intrinsics")
+SLOW_KINDS = ("tiny", "loss", "embedded", "fixed intrinsics")
 KINDS = {
     "tiny": (support.tiny, StepOptions()),
     "dense product": (lambda: support.paper(0), StepOptions()),
@@ -329,6 +329,7 @@ def test_a_padded_solve_equals_the_one_of_the_given_sizes(kind):
     check_same(stepwise(make(), "ceres", options, pad=True), stepwise(make(), "ceres", options))
 
 
+@pytest.mark.slow
 def test_in_mixed_arithmetic_it_is_the_same_to_float32():
     """The preconditioner is a factorisation in float32, behind which conjugate gradients stop at 1e-3."""
     padded, plain = (stepwise(support.tiny(), dtype="mixed", pad=pad) for pad in (True, False))
@@ -380,7 +381,11 @@ def compilations(run) -> int:
 
 
 @pytest.mark.xla
-@pytest.mark.parametrize(("run", "dense"), [(stepwise, False), (solve, True)], ids=["pairs", "dense product"])
+@pytest.mark.parametrize(
+    ("run", "dense"),
+    [(stepwise, False), pytest.param(solve, True, marks=pytest.mark.slow)],
+    ids=["pairs", "dense product"],
+)
 def test_another_problem_of_the_same_cell_compiles_nothing(run, dense):
     """Other numbers of cameras, points and observations, other tracks; some cameras or points unobserved."""
     one, other = mates(dense)

@@ -102,6 +102,7 @@ def test_a_run_goes_on_on_another_number_of_devices_and_back(alone, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_agents_on_devices_of_their_own_are_those_on_one_and_need_not_talk():
     config = dataclasses.replace(CONFIG, seeds=4)
     placement = Placement(jax.devices()[:DEVICES])
@@ -117,6 +118,7 @@ def test_agents_on_devices_of_their_own_are_those_on_one_and_need_not_talk():
     assert [x.data.shape[0] for x in two.replay.rows.addressable_shards] == [2, 2]
 
 
+@pytest.mark.slow
 def test_devices_that_share_environments_talk_once_in_a_step_and_twice_in_an_update():
     placement = Placement(jax.devices()[:DEVICES])
     arguments = CONFIG.sac, CONFIG.loop, placement.divide(CONFIG, game())

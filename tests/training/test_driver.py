@@ -193,6 +193,7 @@ def test_a_run_made_shorter_ends_with_an_evaluation_of_what_it_has(chunks, tmp_p
     assert [best.chunk for (best,) in handed] == ([chunks] if best.score == last else [])
 
 
+@pytest.mark.slow
 def test_several_agents_learn_side_by_side_what_each_learns_alone_also_after_a_kill(whole, tmp_path):
     config = dataclasses.replace(CONFIG, seeds=2)
     straight, broken = tmp_path / "straight", tmp_path / "broken"

@@ -103,6 +103,7 @@ def test_a_reward_that_depends_on_both(agent: str) -> None:
         np.testing.assert_allclose(opinions(agent, toys.BOTH, sign), sign, atol=0.1)
 
 
+@pytest.mark.slow
 def test_critics_see_what_the_policy_does_not() -> None:
     learner = trained("twin", toys.HIDDEN)[0].learner
     seen = jnp.asarray([[0.0, -1.0], [0.0, 1.0]], jnp.float32)
