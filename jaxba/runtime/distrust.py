@@ -21,6 +21,7 @@ import jaxlib
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from jaxba.runtime.atomic import write_text
+from jaxba.runtime.jit import jit
 
 FLAG = "--xla_cpu_max_isa"
 
@@ -51,7 +52,7 @@ def programs_folder(parent: Path) -> Path:
         return folder
     decision = folder / DECISION
     if not decision.exists():
-        distrusted = are_distrusted(serialize(jax.jit(lambda x: x + 1).lower(1.0).compile()))
+        distrusted = are_distrusted(serialize(jit(lambda x: x + 1).lower(1.0).compile()))
         write_text(decision, "AVX2" if distrusted else "all")
         if distrusted:
             print(f"note: XLA refuses its compiled programs here: {FLAG}=AVX2 from now on", file=sys.stderr)
