@@ -27,7 +27,7 @@ import jaxba
 LABORATORY = ("methods", "kitti", "datasets/kitti", "game", "training", "peers", "bench", "paper")
 """Rooms that ask rather than solve, as in tests/test_imports.py; earlier versions had KITTI among the data sets."""
 
-LABORATORY_COMMANDS = ("bench", "train", "kitti", "paper", "episode")
+LABORATORY_COMMANDS = ("bench", "train", "kitti", "paper")
 """Modules of commands that belong to them."""
 
 CORE = ("model", "linear", "refinement", "lm", "structure", "solver", "results")

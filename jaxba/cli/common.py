@@ -6,10 +6,12 @@ import errno
 import gc
 import importlib
 import os
+import re
 import shlex
 import signal
 import stat
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -181,6 +183,24 @@ def use_compilation_cache() -> None:
         return  # without a writable cache folder the command only takes longer
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    _remove_damaged_programs(folder)
+
+
+def _remove_damaged_programs(folder: Path) -> None:
+    """From now on removes cached programs that JAX cannot read: it neither replaces them nor stops to warn of them.
+
+    A process that is killed while it writes one, or a full disk, leaves a part of it (JAX 0.12).
+    """
+    shown = warnings.showwarning
+
+    def show(message: Warning | str, *where: Any, **named: Any) -> None:
+        damaged = re.match(r"Error reading persistent compilation cache entry for '([\w.-]+)'", str(message))
+        if damaged is None:
+            return shown(message, *where, **named)
+        for entry in folder.glob(f"{damaged[1]}-*"):
+            entry.unlink(missing_ok=True)
+
+    warnings.showwarning = show
 
 
 def check_extra(module: str) -> None:

@@ -75,6 +75,7 @@ def _paper(args: Arguments) -> int:
     stem = Path(name).stem
     folder = Path(args.out or Path("runs") / ("paper" if stem == FULL else f"paper-{stem}"))
     report = Path(args.report or folder / REPORT)
+    common.require(report.suffix != ".html", "--report is a Markdown file; the page of figures lies beside it")
     check_apart(
         {"--report": [report, report.with_suffix(".html")], "--out": [folder / CLAIMS]},
         {"the file of --config": [find("paper", name)]},

@@ -67,16 +67,23 @@ def visible(folder: StrPath) -> list[Path]:
     return sorted(path for path in Path(folder).iterdir() if not path.name.startswith("."))
 
 
-def read_bytes(path: StrPath) -> bytes:
-    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name. Raises
-    ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one line."""
+def read_bytes(path: StrPath, decompress: bool = True) -> bytes:
+    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name.
+
+    Args:
+        path: of the file.
+        decompress: not for binary files, which may begin with any number.
+
+    Raises:
+        ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one line.
+    """
     name = display_name(path)
     try:
         with open(path, "rb") as file:
             data = file.read()
-        kind = _compression(data)
+        kind = _compression(data) if decompress else None
         suffix = os.path.splitext(path)[1].lower()
-        if data and suffix in _MAGIC and kind is None:
+        if data and decompress and suffix in _MAGIC and kind is None:
             raise ProblemError(f"{name}: the file is no {suffix[1:]} file, as its name says")
         return data if kind is None else _decompressed(data, _DECODERS[kind])
     except ProblemError:

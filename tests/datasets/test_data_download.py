@@ -128,6 +128,19 @@ def check_one_line(error: str, message: str) -> None:
 # What works
 
 
+def test_what_another_process_received_while_this_one_waited_is_used(server, folder, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def wait(file, _):
+        with open(file.name, "ab") as other:
+            other.write(BODY[:1000])
+
+    monkeypatch.setattr(fcntl, "flock", wait)
+    path, _ = get(server, folder)
+    assert path.read_bytes() == BODY
+    assert server.sent == len(BODY) - 1000
+
+
 @pytest.mark.parametrize("entry", [ENTRY, UNSIGNED])
 def test_a_download_is_the_servers_file_byte_by_byte_and_nothing_else_is_left(server, folder, entry):
     path, new = get(server, folder, entry)

@@ -50,6 +50,16 @@ def test_a_binary_model_is_read_as_the_text_of_the_same_numbers(tmp_path, health
     assert same(problem, healthy)
 
 
+def test_a_binary_file_whose_count_looks_like_the_beginning_of_a_compressed_one_is_read(tmp_path):
+    points = int.from_bytes(b"\x1f\x8b", "little")  # gzip's first bytes
+    index = np.repeat([0, 1], points), np.tile(np.arange(points), 2)
+    cameras = np.tile([0.0, 0, 0, 0, 0, -5, 700, 0, 0], (2, 1))
+    problem = BundleProblem.create(cameras, np.zeros((points, 3)), np.zeros((2 * points, 2)), *index)
+    write_colmap(problem, tmp_path)
+    assert (tmp_path / "points3D.bin").read_bytes()[:2] == b"\x1f\x8b"
+    assert read_problem(tmp_path).num_points == points
+
+
 # What is left out or mended
 
 

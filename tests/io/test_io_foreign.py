@@ -190,6 +190,16 @@ def test_views_that_are_not_reconstructed_are_left_out_and_counted(tmp_path):
         assert read_problem(path).num_cameras == 4
 
 
+def test_each_of_two_observations_in_one_view_of_openmvg_counts(tmp_path):
+    scene = scene_of(Lens())
+    path = write_openmvg(tmp_path / "sfm_data.json", scene, ["pinhole"])
+    contents = json.loads(path.read_text())
+    seen = contents["structure"][0]["value"]["observations"]
+    seen.append(seen[0] | {"value": {"id_feat": 0, "x": [1.0, 2.0]}})
+    path.write_text(json.dumps(contents))
+    assert read_problem(path).num_observations == len(scene.seen) + 1
+
+
 def test_a_principal_point_at_the_edge_is_noted(tmp_path):
     path = write_openmvg(tmp_path / "sfm_data.json", scene_of(Lens(cx=0.0, cy=0.0)), ["pinhole"])
     with pytest.warns(ProblemWarning, match=r"intrinsic 0 lies at the edge of the image: \(0, 0\) of 1600 x 1200"):

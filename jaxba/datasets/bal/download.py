@@ -63,6 +63,7 @@ def fetch(
         with open(partial, "ab") as file:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX)
+                file.seek(0, os.SEEK_END)  # another process may have written while this one waited
             if _is_there(target, checksum):  # another process had the lock
                 return target, False
             try:

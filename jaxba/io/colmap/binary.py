@@ -94,7 +94,7 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray,
     """The records of a file by id, in its order; of `points3D` all points and tracks. `part` is the file's name without
     its ending; `name` is for messages. Raises ProblemError: the file is cut short or too long, or a record cannot be
     understood; one line that names the file and the record."""
-    file, found = _Bytes(read_bytes(path), name, part.removesuffix("3D")[:-1]), {}
+    file, found = _Bytes(read_bytes(path, decompress=False), name, part.removesuffix("3D")[:-1]), {}
     if part == "points3D":
         return _read_points(file)
     first, read_one = fields.FIRST[part], fields.READERS.get(part, _read_image)

@@ -105,5 +105,5 @@ def _lens(model: str, data: Record) -> ForeignLens:
 
 def _landmarks(structure: Record) -> Iterator[Landmark]:
     for key, value in structure.numbered("key", "landmark", "value"):
-        seen = dict(value.get("observations").numbered("key", f"landmark {key}: observation in view", "value"))
-        yield value.get("X").vector(3), list(seen), [one.get("x").vector(2) for one in seen.values()]
+        seen = list(value.get("observations").numbered("key", f"landmark {key}: observation in view", "value"))
+        yield value.get("X").vector(3), [view for view, _ in seen], [one.get("x").vector(2) for _, one in seen]
