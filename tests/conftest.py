@@ -71,10 +71,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     seen = set()
     for item in items:
         whole = item.path.parent.name in WHOLE_ROOMS
-        test = (item.path, item.originalname if whole and isinstance(item, pytest.Function) else None)
-        if test not in seen and not item.get_closest_marker("slow"):
+        slow = item.get_closest_marker("slow") is not None
+        test = (
+            item.path,
+            slow,
+            item.originalname if whole and not slow and isinstance(item, pytest.Function) else None,
+        )
+        if test not in seen:
             seen.add(test)
-            item.add_marker(pytest.mark.sample)
+            item.add_marker(pytest.mark.slow_sample if slow else pytest.mark.sample)
     if config.getoption("compilation") == "full":
         return
     for item in items:
