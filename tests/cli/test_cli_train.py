@@ -237,6 +237,7 @@ def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
     assert "begun with another sac.width" in error
 
 
+@pytest.mark.slow
 def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch):
     def none(*_args, **_kwargs):
         raise InputError("only 0 of 9 scenes are usable: draw more")

@@ -362,6 +362,7 @@ def test_another_policy_of_the_same_shape_compiles_nothing():
     assert not np.array_equal(first.history.damping[:1], second.history.damping[:1])
 
 
+@pytest.mark.slow
 def test_the_first_lambda_of_a_solve_is_the_network_s():
     policy = random_policy(1)
     flat = LearnedPolicy(

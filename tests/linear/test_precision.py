@@ -14,9 +14,10 @@ from jaxba.problem import geometry
 from jaxba.structure.segment_sums import total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("linear_solver", "dtype", "gap"),
-    [("explicit", "mixed", 1e-6), pytest.param("implicit", "float32", 1e-4, marks=pytest.mark.slow)],
+    [("explicit", "mixed", 1e-6), ("implicit", "float32", 1e-4)],
 )
 def test_every_type_ends_at_the_cost_of_float64(linear_solver, dtype, gap):
     problem = random_scene(replace(scene_like("random-150"), cameras=12, points=300, observations=1300), 3)

@@ -116,6 +116,7 @@ def test_float32_is_solved_to_single_precision():
     check(found, wide, blocks, right, 300 * float(np.finfo(np.float32).eps))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [1e-6, 1e-3, 1.0])
 def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypatch, damping):
     """With a camera that nobody observes."""

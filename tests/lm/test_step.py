@@ -55,7 +55,8 @@ PROBLEMS = {
 REPEATING = (
     *("explicit-angle-axis-identity", "implicit-angle-axis-diagonal", "implicit-manifold-identity"),
     *("explicit-cameras-damped-by-10", "implicit-cameras-damped-by-0.01", "sparse-cameras-damped-by-0.01"),
-    *("identity-cameras-damped-by-0.01", "soft_l1", "cauchy"),
+    *("implicit-angle-axis-identity", "implicit-cameras-damped-by-10"),
+    *("identity-cameras-damped-by-0.01", "deeplm-cameras-damped-by-0.01", "soft_l1", "cauchy", "huber"),
 )
 """What the other kinds have in other combinations."""
 

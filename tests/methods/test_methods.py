@@ -113,7 +113,8 @@ def test_the_split_reduced_system_is_block_diagonal():
     assert np.abs(reduced(problem)[apart]).max() > 1
 
 
-@pytest.mark.parametrize("damping", [pytest.param(1e-3, marks=pytest.mark.slow), 30.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [1e-3, 30.0])
 def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_iteration(damping):
     """In the norm of B the error, and in that of B^-1 the residual, falls by at least the spectral radius of
     `B^-1 (B - S)`, which is below one."""

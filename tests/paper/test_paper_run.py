@@ -132,6 +132,7 @@ def error_of(capsys, *argv: str) -> str:
     return error
 
 
+@pytest.mark.slow
 def test_a_folder_of_another_run_is_refused(finished, tmp_path, capsys):
     other = tmp_path / "other.yaml"
     other.write_text(TINY.replace("seeds: 1", "seeds: 2"))

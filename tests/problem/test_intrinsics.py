@@ -134,7 +134,8 @@ def test_the_promised_decrease_and_the_gradient_are_those_of_the_problem_with_sh
     np.testing.assert_allclose(info.gradient_max, gradient, rtol=1e-10)
 
 
-@pytest.mark.parametrize("policy", ["ceres", pytest.param("learned", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["ceres", "learned"])
 def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
     problem = shared()
     copies = copy_matrix(problem)

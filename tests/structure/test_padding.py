@@ -343,6 +343,7 @@ def test_policies_see_the_true_problem(policy):
     check_same(stepwise(problem, policy, pad=True), stepwise(problem, policy))
 
 
+@pytest.mark.slow
 def test_a_band_is_factored_dense_to_the_same_end():
     scene = random_scene(SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
     padded, plain = (stepwise(scene, max_iterations=4, pad=pad) for pad in (True, False))
