@@ -137,6 +137,19 @@ def single() -> BundleProblem:
     return BundleProblem.create(camera, [[0.5, -0.4, 0.7]], [[60.0, -20.0]], [0], [0])
 
 
+def random_views(cameras: int, points: int, seed: int, duplicates: int = 0) -> BundleProblem:
+    """Random views in random order; some are there twice, some cameras and points have none."""
+    rng = np.random.default_rng(seed)
+    seen = rng.random((cameras, points)) < rng.uniform(0.05, 0.5)
+    seen[rng.integers(cameras), rng.integers(points)] = True
+    views = rng.permutation(np.argwhere(seen))
+    views = np.concatenate([views, views[rng.integers(len(views), size=duplicates)]])
+    pixels = rng.normal(size=(len(views), 2))
+    return BundleProblem.create(
+        rng.normal(size=(cameras, 9)), rng.normal(size=(points, 3)), pixels, views[:, 0], views[:, 1]
+    )
+
+
 @functools.cache
 def solved() -> BundleProblem:
     """`tiny` at its minimum."""

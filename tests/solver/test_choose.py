@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from support import random_views
 
 from jaxba import BundleProblem, ProblemError, build_layout
 from jaxba.problem.options import StepOptions
@@ -23,19 +24,6 @@ SEQUENCE = SceneConfig(
     cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
 )
 """A point is seen by up to 18 cameras in a row."""
-
-
-def problem_of(cameras: int, points: int, seed: int, duplicates: int = 0) -> BundleProblem:
-    """Random views in random order; some are there twice, some cameras and points have none."""
-    rng = np.random.default_rng(seed)
-    seen = rng.random((cameras, points)) < rng.uniform(0.05, 0.5)
-    seen[rng.integers(cameras), rng.integers(points)] = True
-    views = rng.permutation(np.argwhere(seen))
-    views = np.concatenate([views, views[rng.integers(len(views), size=duplicates)]])
-    pixels = rng.normal(size=(len(views), 2))
-    return BundleProblem.create(
-        rng.normal(size=(cameras, 9)), rng.normal(size=(points, 3)), pixels, views[:, 0], views[:, 1]
-    )
 
 
 def renumbered(problem: BundleProblem, seed: int) -> BundleProblem:
@@ -52,7 +40,7 @@ def renumbered(problem: BundleProblem, seed: int) -> BundleProblem:
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 25), st.integers(1, 15), st.integers(0, 10**6), st.integers(0, 4))
 def test_pairs_blocks_and_reach_are_those_of_brute_force(cameras, points, seed, duplicates):
-    problem = problem_of(cameras, points, seed, duplicates)
+    problem = random_views(cameras, points, seed, duplicates)
     pairs, shared = 0, np.zeros((cameras, cameras), bool)
     for point in range(points):
         track = problem.camera_index[problem.point_index == point]
@@ -121,11 +109,11 @@ def test_a_few_cameras_are_factored():
 
 def test_many_cameras_that_see_few_points_are_factored_by_way_of_the_points():
     """As with the corners of a calibration board; without that way 2700 unknowns would be factored."""
-    board = problem_of(300, 20, 0)
+    board = random_views(300, 20, 0)
     assert predict(board)["explicit"] < min(predict(board)["sparse"], predict(board)["implicit"])
     assert choose_linear_solver(board, StepOptions(), "auto").linear_solver == "explicit"
     assert build_layout(board).grid is not None
-    twice = problem_of(300, 20, 0, duplicates=1)
+    twice = random_views(300, 20, 0, duplicates=1)
     assert build_layout(twice).grid is None
     assert predict(twice)["explicit"] > 100 * predict(board)["explicit"]
 
@@ -150,7 +138,7 @@ def test_a_solver_without_the_memory_for_it_is_not_chosen(monkeypatch):
 
 
 def test_observations_that_a_gpu_cannot_hold_are_refused_with_the_arithmetic(monkeypatch):
-    problem = problem_of(20, 60, 0)
+    problem = random_views(20, 60, 0)
     needed = 0.5 * choose.BYTES_PER_OBSERVATION * problem.num_observations
     monkeypatch.setattr(choose, "device_memory", lambda: needed + 1)
     choose_linear_solver(problem, StepOptions(), "auto")

@@ -8,26 +8,14 @@ import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
+from support import random_views
 
-from jaxba import BundleProblem, ConjugateGradients, Layout, StepOptions, build_layout, make_method
+from jaxba import ConjugateGradients, Layout, StepOptions, build_layout, make_method
 from jaxba.structure import agglomeration, camera_clusters
 from jaxba.structure.agglomeration import agglomerate, shared_points
 from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout
 
 sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))  # cameras, points, seed
-
-
-def problem_of(cameras: int, points: int, seed: int, duplicates: int = 0) -> BundleProblem:
-    """Random views in random order; some cameras and points may have none, some views are there twice."""
-    rng = np.random.default_rng(seed)
-    seen = rng.random((cameras, points)) < rng.uniform(0.05, 0.7)
-    seen[rng.integers(cameras), rng.integers(points)] = True
-    views = rng.permutation(np.argwhere(seen))
-    views = np.concatenate([views, views[rng.integers(len(views), size=duplicates)]])
-    pixels = rng.normal(size=(len(views), 2))
-    return BundleProblem.create(
-        rng.normal(size=(cameras, 9)), rng.normal(size=(points, 3)), pixels, views[:, 0], views[:, 1]
-    )
 
 
 def clusters_of(layout: Layout) -> ClusterLayout:
@@ -54,7 +42,7 @@ def groups(label) -> set[frozenset[int]]:
 @settings(max_examples=50, deadline=None)
 @given(sizes)
 def test_shared_points_are_those_that_two_cameras_both_see(size):
-    problem = problem_of(*size)
+    problem = random_views(*size)
     cameras, points = problem.num_cameras, problem.num_points
     found, seen = shared_points(np.asarray(problem.camera_index), np.asarray(problem.point_index), cameras, points)
     sees = [set(problem.point_index[problem.camera_index == c].tolist()) for c in range(cameras)]
@@ -149,7 +137,7 @@ def seen_by_cluster(layout: Layout, found: ClusterLayout, values: np.ndarray) ->
 @given(sizes, st.integers(0, 5))
 def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_cameras, size, duplicates):
     """Random whole numbers as weights: a slot that is missing, doubled or in the wrong place changes a sum."""
-    problem = problem_of(*size, duplicates=duplicates)
+    problem = random_views(*size, duplicates=duplicates)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
         layout = build_layout(problem, StepOptions(linear_solver="sparse"))
@@ -186,7 +174,7 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
 
 def test_there_are_never_more_clusters_than_the_limit(monkeypatch):
     monkeypatch.setattr(camera_clusters, "MAX_CLUSTERS", 2)
-    found = clusters_of(build_layout(problem_of(30, 25, 0), StepOptions(linear_solver="sparse")))
+    found = clusters_of(build_layout(random_views(30, 25, 0), StepOptions(linear_solver="sparse")))
     assert len(found.members) == 2
 
 
