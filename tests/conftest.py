@@ -20,6 +20,7 @@ from pathlib import Path
 import jax
 import jaxtyping
 import pytest
+import threadpoolctl
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -35,6 +36,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # a worker of pytest-xdist inherits the flags
     if config.getoption("compilation") == "quick" and not hasattr(config, "workerinput"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for workers, children, and what is imported from here on
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", 3)
     cache = getattr(config, "cache", None)
@@ -119,6 +121,14 @@ def few_programs():
     yield
     process.MAPPINGS_SHARE = share
     process.release_programs()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_blas_thread():
+    """Beside another busy process several threads make a dense factorisation up to two hundred times slower: they wait
+    by spinning."""
+    with threadpoolctl.threadpool_limits(1, "blas"):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from jaxba.linear.band_cholesky import band_factor, band_rows
-from jaxba.runtime.process import single_blas_thread
 from jaxba.structure.camera_ordering import TILE_CAMERAS, Band, band_of
 
 solve = jax.jit(lambda band, blocks, right: band_factor(band, blocks).solve(right))
@@ -26,13 +25,6 @@ SHAPES = [
     pytest.param(25, 13, 2, id="many-tiles-wide"),
     pytest.param(70, 17, TILE_CAMERAS, id="as-in-a-layout"),
 ]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with single_blas_thread():
-        yield
 
 
 def system(cameras: int, width: int, tile: int) -> tuple[Band, np.ndarray, np.ndarray, np.ndarray]:

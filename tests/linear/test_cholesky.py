@@ -9,16 +9,8 @@ import pytest
 
 from jaxba.linear import cholesky
 from jaxba.linear.cholesky import MIN_UNKNOWNS, PANEL, Panels, factor_and_solve, factor_panels
-from jaxba.runtime.process import single_blas_thread
 
 solve = jax.jit(factor_and_solve)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with single_blas_thread():
-        yield
 
 
 def spd(n: int, condition: float = 1e4, seed: int = 0) -> np.ndarray:

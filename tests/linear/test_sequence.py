@@ -12,7 +12,6 @@ from support import start, step
 
 from jaxba import BundleProblem, StepOptions, build_layout
 from jaxba.problem.options import ConjugateGradients
-from jaxba.runtime.process import single_blas_thread
 from jaxba.scenes import SceneConfig, random_scene
 
 EXACT = StepOptions()
@@ -27,13 +26,6 @@ OPTIONS = {
     ),
 }
 DAMPING = 1e-4
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with single_blas_thread():
-        yield
 
 
 @functools.cache

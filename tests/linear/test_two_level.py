@@ -24,20 +24,12 @@ from jaxba.linear.two_level import SIMILARITY, camera_modes, cluster_sum, coarse
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.runtime.compilation import compiler_options
-from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 
 MODES = SIMILARITY + 3
 
 MANIFOLD = StepOptions(linear_solver="implicit", coordinates=Coordinates(rotation="manifold"))
 IDENTITY = Coordinates(rotation="manifold", scaling="identity")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with single_blas_thread():
-        yield
 
 
 def whitened(problem: BundleProblem) -> BundleProblem:

@@ -11,17 +11,9 @@ import support
 from jaxba import StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
 from jaxba.linear import factored
 from jaxba.linear.woodbury import capacitance_solve
-from jaxba.runtime.process import single_blas_thread
 from jaxba.structure.density import has_few_points
 
 CAMERAS, COLUMNS = 4, 6
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with single_blas_thread():
-        yield
 
 
 def system(seed: int = 0, smallest: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

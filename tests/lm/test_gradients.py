@@ -19,7 +19,6 @@ from jaxba.linear.cholesky import lower_cholesky
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
-from jaxba.runtime.process import single_blas_thread
 from jaxba.scenes import SceneConfig
 from jaxba.structure.layout import Layout
 from jaxba.structure.observation_order import ObservationOrder
@@ -30,13 +29,6 @@ pytestmark = pytest.mark.step
 DAMPING = 1e-2
 PLAIN = StepOptions()
 TO_THE_END = ConjugateGradients(forcing=0.0, tolerance=1e-14, max_iterations=5000)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with single_blas_thread():
-        yield
 
 
 def in_first_camera(problem: BundleProblem) -> BundleProblem:

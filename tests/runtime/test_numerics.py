@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import DAMPINGS, paper, solve_options
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import jaxba
 from jaxba.runtime import process
@@ -163,7 +163,13 @@ def blas_threads() -> list[int]:
 def test_contexts_that_overlap_give_blas_its_threads_back():
     with process.single_blas_thread():
         pass  # loads the library
+    with threadpool_limits(2, "blas"):
+        check_overlap()
+
+
+def check_overlap() -> None:
     before = blas_threads()
+    assert set(before) == {2}
     entered, leave = threading.Event(), threading.Event()
 
     def other() -> None:
