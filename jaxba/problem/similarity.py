@@ -18,6 +18,9 @@ LEAST_SPREAD = 1e-12
 """Second singular value of the covariance, as a share of the first, below which the positions lie on a line, so that
 the rotation about it is undetermined."""
 
+SAME_LINE = 1e-12
+"""Sine of the angle below which two unit vectors are taken to lie on one line."""
+
 
 class Similarity(NamedTuple):
     """`x -> scale R x + t`."""
@@ -87,8 +90,6 @@ def along_line(
 ) -> Similarity:
     """The similarity that takes the line through `source` to that through `target`, by the smallest rotation, without a
     turn about it. Arguments as for `umeyama`; the points of neither may be at one place."""
-    from scipy.spatial.transform import Rotation
-
     shares = weights / weights.sum()
     mean_source, mean_target = shares @ source, shares @ target
     a = source - mean_source
@@ -96,5 +97,23 @@ def along_line(
     along = a @ line
     slope = (shares * along) @ (target - mean_target) / (shares @ along**2)
     scale = float(np.linalg.norm(slope))
-    rotation = Rotation.align_vectors([slope / scale], [line])[0].as_matrix()
+    rotation = smallest_rotation(line, slope / scale)
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def smallest_rotation(source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation by the smallest angle that takes one unit vector to another; where they are opposite, one of them.
+
+    SciPy's `Rotation.align_vectors` is wrong by 1e-5 between vectors that are so far from opposite, on some processors.
+    """
+    cosine = source @ target
+    across = target - cosine * source
+    if np.linalg.norm(across) < SAME_LINE:
+        across = np.eye(3)[np.argmin(np.abs(source))]  # any direction across the line
+    for _ in range(2):  # the second time for what was lost where the first difference is small
+        across = across - (across @ source) * source
+        across = across / np.linalg.norm(across)
+    sine = target @ across
+    plane = np.stack([source, across], axis=1)
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    return np.eye(3) + plane @ (turn - np.eye(2)) @ plane.T

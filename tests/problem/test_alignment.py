@@ -77,7 +77,7 @@ def test_a_flight_with_a_second_strip_determines_the_roll():
 
 def test_a_line_is_mapped_to_a_line_by_the_smallest_rotation():
     rng = np.random.default_rng(1)
-    for angle in (0.0, 0.7, np.pi - 1e-5, np.pi):
+    for angle in (0.0, 1e-9, 0.7, np.pi - 1e-3, np.pi - 1e-5, np.pi - 1e-9, np.pi):
         axis = np.cross([1.0, 2.0, 0.5], rng.normal(size=3))
         turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
         source = np.array([1.0, 2.0, 3.0]) + np.outer(rng.normal(size=6), [1.0, 2.0, 0.5])
