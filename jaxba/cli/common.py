@@ -158,19 +158,29 @@ def exit_with(status: int) -> NoReturn:
     sys.exit(status)
 
 
-def prepare_process() -> None:
-    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK."""
+def prepare_process(*, untraced: bool = False) -> None:
+    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK.
+
+    Args:
+        untraced: which cache; see `use_compilation_cache`.
+    """
     from jaxba.runtime import process
 
     process.keep_memory()
-    use_compilation_cache()
+    use_compilation_cache(untraced)
     process.load_lapack()
 
 
-def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder by JAX's own cache, so that the next run starts faster."""
+def use_compilation_cache(untraced: bool = False) -> None:
+    """Keeps compiled programs in the user's cache folder, so that the next run starts faster.
+
+    Args:
+        untraced: whether by `runtime/executable_cache.py`, which finds programs without tracing them, but only those
+            that are compiled in parallel. Otherwise by JAX's own cache, which excludes the other.
+    """
     import jax
 
+    from jaxba.runtime.compilation import use_cache
     from jaxba.runtime.distrust import programs_folder
     from jaxba.runtime.user_cache import user_cache
 
@@ -181,6 +191,9 @@ def use_compilation_cache() -> None:
         folder = programs_folder(Path(choice) if choice else user_cache("xla"))
     except OSError:
         return  # without a writable cache folder the command only takes longer
+    if untraced:
+        use_cache(folder)
+        return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     _remove_damaged_programs(folder)

@@ -307,7 +307,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.runtime.distributed import together
 
     path, problem = together(lambda: _checked(args))
-    common.prepare_process()
+    common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))

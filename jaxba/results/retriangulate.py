@@ -30,7 +30,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
-from jaxba.runtime.compilation import program, quick_runs
+from jaxba.runtime.compilation import compile_and_run, program, quick_runs
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.place import check_problem, placed
@@ -115,7 +115,7 @@ def retriangulate_without(
         level = "quick" if quick_runs("acceptance", here.num_observations) > EQUIVALENT_STEPS else "full"
         search = program(_search, "loss", level=level)
         arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
-        found, moved, before, after = jax.device_get(search(*arguments))
+        found, moved, before, after = jax.device_get(compile_and_run(search, *arguments))
         process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(before):
         raise ProblemError(explain_start(problem, loss))

@@ -11,17 +11,20 @@ compiled in parallel.
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 from jax import monitoring
 
+from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
 from jaxba.runtime.fusion import fast_compilation
 from jaxba.runtime.jit import Options, jit, known_options, right_options
 
@@ -84,9 +87,12 @@ class Program:
 
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
+        self.options = right_options() | compiler_options(level)
         self._fast = uses_older_emitters(level)
-        options = right_options() | compiler_options(level)
-        self._jitted = jax.jit(_strongly_typed(function), static_argnames=static, compiler_options=options)
+        self._jitted = jax.jit(
+            _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
+        )
+        self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
     def __call__(self, *arguments: Any) -> Any:
         with fast_compilation(self._fast):
@@ -97,6 +103,11 @@ class Program:
         with fast_compilation(self._fast):
             traced = self._jitted.trace(*arguments)
             return traced.lower(), traced.out_info
+
+    def split(self, arguments: tuple[Any, ...]) -> tuple[dict[str, Any], tuple[Any, ...]]:
+        """Static arguments by name, and the others."""
+        named = list(zip(self._static, arguments, strict=False))
+        return {name: x for name, x in named if name}, tuple(x for name, x in named if not name)
 
 
 def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -122,6 +133,22 @@ def program(function: Callable[..., Any], *static: str, level: Level = "full") -
     return Program(function, static, level)
 
 
+_cache: ExecutableCache | None = None
+
+
+def use_cache(folder: Path | None) -> None:
+    """Makes `ParallelCompilation` read compiled programs from a folder, and store new ones there for later processes.
+
+    For programs of one device. Where JAX's own compilation cache is switched on it is the only one: a program that JAX
+    has read from there cannot be written again.
+
+    Args:
+        folder: must exist and be writable by nobody else; None switches the cache off.
+    """
+    global _cache
+    _cache = None if folder is None else ExecutableCache(folder)
+
+
 class ParallelCompilation:
     """A context in which programs are compiled in parallel, and not run; `run` then runs them without compiling.
 
@@ -132,13 +159,19 @@ class ParallelCompilation:
     """
 
     def __init__(self) -> None:
+        self.loaded: dict[Program, CachedExecutable] = {}
+        """Programs that were read from disk."""
+        self._verified: set[Program] = set()  # of these, the ones that have run once
+        # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
+        # disk, which are bound to a device
+        self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
         self.late_s = 0.0
         """Seconds in which `run` has compiled programs that nobody had asked for before."""
 
     def __enter__(self) -> ParallelCompilation:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
-        self._waiting: deque[Callable[[], Any]] = deque()
+        self._waiting: deque[Callable[[], None]] = deque()
         self._jobs: list[Future[None]] = []
         return self
 
@@ -153,19 +186,54 @@ class ParallelCompilation:
             Shapes and types of its results, to be arguments of the next.
         """
         if function not in self._results:
-            lowered, self._results[function] = function.lower(*arguments)
-            self._waiting.append(lowered.compile)
-            self._jobs.append(self._pool.submit(self._compile_next))
+            self._results[function] = self._begin(function, *arguments)
         return self._results[function]
 
+    def _begin(self, function: Program, *arguments: Any) -> Any:
+        cache, path = None if jax.config.values.get("jax_compilation_cache_dir") else _cache, None
+        if cache is not None:
+            path = cache.path_for(function.function, *function.split(arguments), function.options)
+            if (stored := cache.load(path)) is not None:
+                self.loaded[function] = stored
+                return stored.out
+        lowered, out = function.lower(*arguments)
+
+        def compile_and_store() -> None:
+            with watch_compilation() as was_compiled:
+                compiled = lowered.compile()
+            if cache is not None:
+                self._compiled[function] = compiled
+                if was_compiled():
+                    cache.save(path, compiled, out)
+
+        self._waiting.append(compile_and_store)
+        self._jobs.append(self._pool.submit(self._compile_next))
+        return out
+
     def run(self, function: Program, *arguments: Any) -> Any:
-        """What the program computes. It is compiled now if the context has not had it."""
+        """What the program computes. It is compiled now, or read from disk, if the context has not had it."""
         if function not in self._results:
             started = time.perf_counter()
             with self:
                 self(function, *arguments)
             self.late_s += time.perf_counter() - started
-        return function(*arguments)
+        given = function.split(arguments)[1]
+        if function in self._compiled:
+            return self._compiled[function](*given)
+        stored = self.loaded.get(function)
+        if stored is None:
+            return function(*arguments)
+        if function in self._verified:
+            return stored.run(*given)
+        try:
+            result = jax.block_until_ready(stored.run(*given))
+        except Exception:  # XLA finds some damage only when it runs a program
+            del self.loaded[function]
+            if _cache is not None:
+                _cache.remove(stored)
+            return function(*arguments)
+        self._verified.add(function)
+        return result
 
     def _compile_next(self) -> None:
         try:
@@ -184,6 +252,13 @@ class ParallelCompilation:
         if kind is None:
             for job in self._jobs:
                 job.result()
+
+
+def compile_and_run(function: Program, *arguments: Any) -> Any:
+    """What a program computes, for one that runs once; it is read from the cache of `use_cache` if it is there."""
+    with ParallelCompilation() as compile_programs:
+        compile_programs(function, *arguments)
+    return compile_programs.run(function, *arguments)
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:

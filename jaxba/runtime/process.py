@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import gc
 import importlib.util
 import os
@@ -190,6 +191,15 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
+@functools.cache
+def register_lapack() -> None:
+    """Lets jaxlib look up LAPACK's routines in SciPy, which it does when it first lowers a call of one on a CPU. A
+    compiled program from a file that calls one before would crash."""
+    import jax
+
+    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), "float32"))
+
+
 def load_lapack() -> None:
     """Loads the BLAS and LAPACK of SciPy that XLA on a CPU calls, without the rest of `scipy.linalg`.
 
@@ -200,12 +210,10 @@ def load_lapack() -> None:
     spec = None if name in sys.modules else importlib.util.find_spec(name)
     if spec is None:
         return
-    import jax
-
     sys.modules[name] = importlib.util.module_from_spec(spec)  # knows where its modules are; none is imported
-    try:  # jaxlib looks the routines up when it first lowers a call of one
-        jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), "float32"))
+    try:
+        register_lapack()
     except ImportError:  # a SciPy whose modules need more of the package; it is imported later, as usual
-        pass
+        register_lapack.cache_clear()
     finally:
         del sys.modules[name]

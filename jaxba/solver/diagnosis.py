@@ -15,7 +15,7 @@ from jaxba.problem.labels import part_name
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import COST_ROUNDING
-from jaxba.runtime.compilation import program
+from jaxba.runtime.compilation import compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.place import placed
 from jaxba.structure.layout import NO_SYSTEM, Layout, build_layout
@@ -36,7 +36,7 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     with numerics(dtype):
         here = placed(problem).here
         layout = build_layout(here, NO_SYSTEM)
-        found = program(_start_terms, "loss", "dtype", level="quick")(layout, here, loss, dtype)
+        found = compile_and_run(program(_start_terms, "loss", "dtype", level="quick"), layout, here, loss, dtype)
         costs, inverse_depth = (np.asarray(x) for x in found)
     slots = np.flatnonzero(np.asarray(layout.slot_mask) & ~np.isfinite(costs))
     narrow = "" if dtype == np.float64 else f" in {dtype}; float64 has a larger range"

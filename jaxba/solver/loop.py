@@ -14,7 +14,7 @@ import numpy as np
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.runtime.compilation import CompileClock, Program
+from jaxba.runtime.compilation import CompileClock, compile_and_run
 from jaxba.solver.iteration import Carry, solve_loop
 from jaxba.solver.prepare import Setup
 from jaxba.solver.sharded import Shards
@@ -77,7 +77,7 @@ class Compiled(Driver):
 
     def begin(self) -> LMState:
         """The state at the start."""
-        self._start = jax.block_until_ready(self.setup.initial(Program.__call__))
+        self._start = jax.block_until_ready(self.setup.initial(compile_and_run))
         return self._start
 
     def finish(self) -> tuple[StepInfo, Termination]:

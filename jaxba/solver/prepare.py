@@ -19,7 +19,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
-from jaxba.runtime.compilation import CompileClock, Program, program
+from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.diagnosis import explain_start
@@ -131,7 +131,7 @@ def prepare(
     if setup.shards is not None:
         raise ProblemError("prepare is for one device; jaxba.solve divides a problem among several")
     with numerics(setup.dtype), CompileClock() as clock:
-        state = jax.block_until_ready(setup.initial(Program.__call__))
+        state = jax.block_until_ready(setup.initial(compile_and_run))
     setup.check_cost(state)
     return Prepared(**vars(setup), state=state, compile_s=clock.seconds)
 

@@ -82,7 +82,7 @@ class Stepwise(Driver):
             self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
         state = jax.block_until_ready(setup.initial(self._run))
         self.carry = jax.block_until_ready(self._begin(self._run, state))
-        if self.clock.seconds > 0:
+        if self.clock.seconds > 0 or self._programs.loaded:
             # warm-up, so that the first iteration is timed like later ones: a first run also allocates memory
             if self._optimised:
                 jax.block_until_ready(self._iterate(self._run, self.carry)[2])

@@ -1,0 +1,278 @@
+"""Compiled programs on disk, found without tracing them.
+
+JAX's own compilation cache needs a program's text, which takes tracing and lowering: two thirds of what is left of
+compilation where every program is cached. Here the key is what the text follows from: the function, the types of its
+arguments, its static arguments, this package's source, and JAX; `distrust.programs_folder` has a folder for each kind
+of processor and jaxlib. A file has one line of JSON with the types of the results, and the executable as XLA writes and
+reads it; nothing else in it is ever run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib
+import json
+import os
+import threading
+import time
+import types
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import monitoring
+from jaxlib import xla_client
+
+from jaxba.runtime import process
+from jaxba.runtime.atomic import TEMPORARY, atomic_write
+
+SUFFIX = ".jaxba-program"
+
+LIMIT = 1 << 30
+"""Bytes that a folder's programs may have; the least recently used are removed first."""
+
+ABANDONED_S = 3600.0
+"""Age of a temporary file whose writer must have been killed."""
+
+IN_MEMORY = 16
+"""Programs read from disk that a process keeps: a solve has six."""
+
+_PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
+"""Settings of JAX that change no program."""
+
+
+class CachedExecutable(NamedTuple):
+    """A compiled program and what it returns."""
+
+    run: Callable[..., Any]  # takes the arguments that are not static
+    out: Any  # shapes and types
+    path: Path
+
+
+class ExecutableCache:
+    """Programs in a folder. Like JAX's cache it holds native code: use a folder that nobody else writes to."""
+
+    def __init__(self, folder: Path) -> None:
+        """Args:
+        folder: where they are; that it can be written is not needed.
+        """
+        self.folder = folder
+        self._source = _source()  # read now: the files may be edited while the process goes on
+
+    def path_for(
+        self, function: Callable[..., Any], static: dict[str, Any], arguments: tuple[Any, ...], options: Any = None
+    ) -> Path | None:
+        """The file of a program, whether it exists or not.
+
+        Args:
+            function: of this package; what it computes follows from its arguments and the source.
+            static: its static arguments, by name.
+            arguments: the others, in their order: pytrees of arrays, or of shapes and types.
+            options: XLA's, for this program.
+
+        Returns:
+            A path; None where the key would not determine the program: where a function or class from outside this
+            package is part of it, a user's own damping rule for instance.
+        """
+        try:
+            leaves, tree = jax.tree.flatten(arguments)
+            key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
+            key += map(_describe_type, leaves)
+        except _UnknownSource:
+            return None
+        digest = hashlib.sha256("\n".join([*key, _environment(), self._source]).encode()).hexdigest()
+        return self.folder / f"{function.__name__}-{digest[:40]}{SUFFIX}"
+
+    def load(self, path: Path | None) -> CachedExecutable | None:
+        """The program of a file, which `path_for` returned; None where there is none, or none that can be read."""
+        if path is None or not path.is_file():
+            return None
+        try:
+            stored = _load(path)
+        except Exception:  # of another version, damaged, or gone: it is compiled anew and overwritten
+            return None
+        with contextlib.suppress(OSError):  # the folder may belong to another user
+            os.utime(path)
+        return stored
+
+    def save(self, path: Path | None, compiled: jax.stages.Compiled, out: Any) -> None:
+        """Writes a program, whole or not at all; does nothing if it cannot be written.
+
+        Args:
+            path: what `path_for` returned.
+            compiled: compiled in this process (`watch_compilation`): a program that JAX has read from its own cache is
+                serialised without some of its functions.
+            out: shapes and types of its results.
+        """
+        if path is None:
+            return
+        try:
+            executable: Any = compiled.runtime_executable()
+            if len(executable.get_parameter_layouts()) != len(jax.tree.leaves(compiled.args_info)):
+                return  # it has constants that are not in its text
+            header = json.dumps(_to_json(out)).encode()
+            content = zlib.compress(header + b"\n" + executable.client.serialize_executable(executable), 1)
+        except Exception:  # one that calls Python, for instance, exists in its process alone
+            return
+        with contextlib.suppress(OSError):
+            with atomic_write(path) as file:
+                file.write(content)
+            self._evict()
+
+    def remove(self, stored: CachedExecutable) -> None:
+        """Removes a program that could be read, but not run."""
+        _load.cache_clear()
+        with contextlib.suppress(OSError):
+            stored.path.unlink()
+
+    def _evict(self) -> None:
+        """Removes the least recently used programs, down to `LIMIT`, and what was never finished."""
+        for part in self.folder.glob(TEMPORARY.format("*")):
+            if part.stat().st_mtime < time.time() - ABANDONED_S:
+                part.unlink(missing_ok=True)
+        found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
+        total = 0
+        for status, file in found:
+            total += status.st_size
+            if total > LIMIT:
+                file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def watch_compilation() -> Iterator[Callable[[], bool]]:
+    """Gives a function that tells whether this thread has compiled a program within the context.
+
+    False where JAX read the program from its own cache instead.
+    """
+    thread, events = threading.get_ident(), set()
+
+    def listen(event: str, *_: Any, **__: Any) -> None:
+        if threading.get_ident() == thread:
+            events.add(event)
+
+    hit, done = "/jax/compilation_cache/cache_hits", "/jax/core/compile/backend_compile_duration"
+    monitoring.register_event_listener(listen)
+    monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield lambda: done in events and hit not in events
+    finally:
+        monitoring.unregister_event_listener(listen)
+        monitoring.unregister_event_duration_listener(listen)
+
+
+@functools.lru_cache(maxsize=IN_MEMORY)
+def _load(path: Path) -> CachedExecutable:
+    header, _, code = zlib.decompress(path.read_bytes()).partition(b"\n")
+    out = _from_json(json.loads(header))
+    process.register_lapack()
+    device = jax.devices()[0]
+    devices = xla_client.DeviceList((device,))
+    executable = device.client.deserialize_executable(code, executable_devices=devices)
+
+    def run(*arguments: Any) -> Any:
+        results = executable.execute_sharded(jax.device_put(jax.tree.leaves(arguments), device))
+        arrays = [array for (array,) in results.disassemble_into_single_device_arrays()]
+        return jax.tree.unflatten(jax.tree.structure(out), arrays)
+
+    return CachedExecutable(run, out, path)
+
+
+def _to_json(out: Any) -> Any:
+    """Shapes and types of arrays in tuples of this package, as JSON."""
+    if out is None:
+        return None
+    if isinstance(out, tuple):
+        return {"class": _name(type(out)), "parts": [_to_json(part) for part in out]}
+    if not hasattr(out, "dtype"):
+        raise _UnknownSource(repr(out))
+    return [str(out.dtype), *out.shape]
+
+
+def _from_json(value: Any) -> Any:
+    """The reverse. Makes nothing but tuples of this package."""
+    if value is None:
+        return None
+    if isinstance(value, list):
+        return jax.ShapeDtypeStruct(tuple(value[1:]), np.dtype(value[0]))
+    parts = [_from_json(part) for part in value["parts"]]
+    if value["class"] == "builtins.tuple":
+        return tuple(parts)
+    module, _, name = value["class"].rpartition(".")
+    kind = getattr(importlib.import_module(module), name) if module.startswith("jaxba.") else None
+    if not (isinstance(kind, type) and issubclass(kind, tuple)):
+        raise _UnknownSource(value["class"])
+    return kind(*parts)
+
+
+class _UnknownSource(Exception):
+    """A function or value whose description does not determine what it computes."""
+
+
+def _name(thing: Any) -> str:
+    """Name of a function or class whose source is known."""
+    module, name = thing.__module__, thing.__qualname__
+    if module.split(".")[0] not in ("jaxba", "builtins") or "<" in name:
+        raise _UnknownSource(f"{module}.{name}")
+    return f"{module}.{name}"
+
+
+def _describe(value: Any) -> str:
+    """A text that differs for different static values."""
+    if value is None or isinstance(value, (str, bool, int, float, np.dtype)):
+        return repr(value)
+    if isinstance(value, (tuple, list)):
+        return f"({', '.join(map(_describe, value))})"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{_describe(key)}: {_describe(value[key])}' for key in sorted(value))}}}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
+        return f"{_name(type(value))}{_describe(dict(fields))}"
+    if isinstance(value, functools.partial):
+        return _describe((value.func, *value.args))
+    if (
+        isinstance(value, types.FunctionType)
+        and "<" not in value.__qualname__
+        and value.__module__.startswith("jaxba.")
+    ):
+        return _name(value)  # its source is part of the key
+    raise _UnknownSource(repr(value))
+
+
+def _describe_tree(tree: Any) -> str:
+    """The same for the structure of a pytree."""
+    node = tree.node_data()
+    if node is None:
+        return "*"
+    kind, metadata = node
+    return f"{_name(kind)} {_describe(metadata)} [{', '.join(map(_describe_tree, tree.children()))}]"
+
+
+def _describe_type(leaf: Any) -> str:
+    if not hasattr(leaf, "dtype"):
+        return type(leaf).__name__
+    return f"{leaf.dtype}{leaf.shape}{'weak' if getattr(leaf, 'weak_type', False) else ''}"
+
+
+def _environment() -> str:
+    """Everything outside a program that decides how it is compiled: JAX's settings, XLA's flags, the machine."""
+    settings = {name: value for name, value in jax.config.values.items() if not name.startswith(_PRIVATE)}
+    settings["float"] = jnp.result_type(float)  # whether this thread has x64 on
+    devices = [f"{device.platform} {device.device_kind} {device.client.platform_version}" for device in jax.devices()]
+    flags = os.environ.get("XLA_FLAGS", "")
+    return f"{sorted(settings.items())}\n{flags}\n{devices}\n{jax.__version__} {os.cpu_count()}"
+
+
+def _source() -> str:
+    """Digest of this package's source."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parent.parent
+    for file in sorted(folder.rglob("*.py")):
+        digest.update(f"{file.relative_to(folder)}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
