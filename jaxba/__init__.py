@@ -1,5 +1,10 @@
 """Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from jaxba.damping import (
     POLICIES,
     Ceres,
@@ -55,7 +60,20 @@ from jaxba.structure.layout import Layout, build_layout
 from jaxba.typing import register_pytree
 from jaxba.viewer.notebook import view
 
+if TYPE_CHECKING:
+    from jaxba.training.api import make_env, train
+
 __version__ = "0.1.0"
+
+_OF_THE_LABORATORY = {"make_env": "jaxba.training.api", "train": "jaxba.training.api"}
+"""Modules of public names that are loaded when they are first asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _OF_THE_LABORATORY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_OF_THE_LABORATORY[name]), name)
+
 
 __all__ = [
     "CAMERA_MODELS",
@@ -105,6 +123,7 @@ __all__ = [
     "inputs_of",
     "lm_step",
     "load_policy",
+    "make_env",
     "make_method",
     "make_policy",
     "normalize",
@@ -126,6 +145,7 @@ __all__ = [
     "solve",
     "solve_and_retriangulate",
     "solve_loop",
+    "train",
     "trained_step",
     "view",
     "with_gauge",

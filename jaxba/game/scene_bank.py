@@ -24,6 +24,7 @@ from jaxba.game.rollout import play
 from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.game.windows import read_windows
+from jaxba.io.files import StrPath
 from jaxba.model.linearize import cost
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.losses import Loss
@@ -224,6 +225,7 @@ def make_banks(
     limit: int,
     report: Callable[[str], None] = lambda _: None,
     tolerance: float = 1e-3,
+    problems: Sequence[StrPath | BundleProblem] = (),
 ) -> list[Split]:
     """Draws and solves scenes of every class, and splits the usable ones.
 
@@ -234,6 +236,7 @@ def make_banks(
         limit: iterations of an episode.
         report: called with a line of text when something begins that takes a while.
         tolerance: of the game; it does not change which scenes are usable.
+        problems: in memory or files, of which windows are cut instead of those that `config` names.
 
     Raises:
         InputError: no scene of a class would be left to train on.
@@ -248,7 +251,7 @@ def make_banks(
         )
         if kind.family == "windows":
             seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))
-            parts = read_windows(config.problems, kind, count, seed, config.dtype)
+            parts = read_windows(problems or config.problems, kind, count, seed, config.dtype)
             banks = [select(*solved(scenes)) for scenes in parts]
         else:
             made, usable = solved(make_scenes(kind, class_key, count, config.dtype))

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba.game.random_scenes import MIN_VIEWS, START_CENTER, START_DEPTH, START_ROTATION, SceneClass, Scenes
 from jaxba.io import read_problem
+from jaxba.io.files import StrPath
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
@@ -28,12 +29,12 @@ FEWEST_CAMERAS = 4
 
 
 def read_windows(
-    paths: Sequence[str], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
+    problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
 ) -> tuple[Scenes, Scenes]:
     """Windows of problems: those to train on, and held-out ones from other places.
 
     Args:
-        paths: problems, as `jaxba.read_problem` takes them.
+        problems: in memory, or files as `jaxba.read_problem` takes them.
         kind: largest numbers of cameras and points of a window.
         count: windows in all, as many of each problem; a fifth is held out.
         seed: of the choice.
@@ -43,30 +44,33 @@ def read_windows(
         ProblemError: as `read_all`.
     """
     parts: tuple[list, list] = [], []
-    for number, problem in enumerate(read_all(paths)):
+    for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])
-        share = -(-count // len(paths))
+        share = -(-count // len(problems))
         linked, held = covisible(problem), round(HELD_OUT * share)
         for part, cameras, wanted in zip(parts, places(linked), (share - held, held), strict=True):
             if len(cameras) >= FEWEST_CAMERAS:
                 part.extend(window(problem, kind, linked, cameras, rng) for _ in range(wanted))
-    shuffle = np.random.default_rng([seed, len(paths)]).permutation  # so that the first windows are of all problems
+    shuffle = np.random.default_rng([seed, len(problems)]).permutation  # so that the first windows are of all problems
     train, held_out = ([part[k] for k in shuffle(len(part))] for part in parts)
     typed = lambda x: jnp.asarray(x, None if x.dtype == bool else dtype)
     stack = lambda part: Scenes(*(typed(np.stack([getattr(one, name) for one in part])) for name in Scenes._fields))
     return stack(train), stack(held_out)
 
 
-def read_all(paths: Sequence[str]) -> list[BundleProblem]:
-    """The problems.
+def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
+    """The problems, in memory or files.
 
     Raises:
         ProblemError: a problem cannot be read, has whitened observations, other lenses than BAL's or too few cameras;
             or none is large enough for windows in two places. One line.
     """
     problems = []
-    for path in paths:
-        problem = read_problem(path)
+    for number, path in enumerate(given):
+        if isinstance(path, BundleProblem):
+            problem, path = path, f"problem {number}"
+        else:
+            problem = read_problem(path)
         if problem.whitening is not None:
             raise ProblemError(f"{path}: windows of observations with covariances are not made")
         if problem.lenses is not None and not problem.lenses.all_bal:

@@ -1,0 +1,146 @@
+"""The game and its trainer from Python: `jaxba.make_env` and `jaxba.train`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+from jaxba.damping.learned import LearnedPolicy
+from jaxba.game.env import Game, Reward, RewardFunction, make_game
+from jaxba.game.scene_bank import Bank, make_banks
+from jaxba.io.files import StrPath
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.runtime import process
+from jaxba.runtime.numerics import numerics
+from jaxba.training import driver
+from jaxba.training.config import TrainConfig, load, with_problems
+from jaxba.training.task import Task
+from jaxba.typing import register_pytree
+
+if TYPE_CHECKING:
+    from jaxba.game.gym import GymGame, GymVectorGame
+
+EVALUATIONS = 10
+"""Evaluations of a training, after equal parts of it."""
+
+
+@register_pytree
+@dataclass(frozen=True)
+class PresetGame(Game):
+    """A game with the settings that an agent is trained with."""
+
+    held_out: tuple[Bank, ...] = ()
+    """Scenes that no training sees, a bank per class."""
+
+    preset: TrainConfig = field(default_factory=TrainConfig, metadata={"static": True})
+    """Everything else: networks, learning, sizes."""
+
+
+def make_env(
+    preset: str = "paper",
+    *overrides: str,
+    problems: Sequence[StrPath | BundleProblem] = (),
+    reward: Reward | RewardFunction | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> PresetGame:
+    """The game of a preset: an environment of many scenes that step together.
+
+    It has `reset(key)` and `step(state, actions)`, pure functions that may be jitted, and `num_envs`,
+    `observation_size` and `action_size`; see `game/protocol.py`. They run in 64 bits, with `jax.enable_x64(True)` or
+    inside a program that has it on.
+
+    Args:
+        preset: name of a preset of `jaxba-train`, or the path of a YAML file.
+        overrides: settings that replace those of the preset, as `"sac.width=128"`.
+        problems: scenes of your own instead of random ones: windows of neighbouring cameras are cut from these
+            problems, in memory or files, and the last fifth of every problem is held out.
+        reward: instead of the preset's: a name, or a function of the iteration (`StepInfo`), the best known cost of
+            the scene and whether the episode has ended in success, which returns a number.
+        report: called with a line of text when something begins that takes a while.
+
+    Raises:
+        SettingsError: no such preset, or an impossible setting.
+        InputError: no scene would be left to train on, or the problems are no source of windows.
+    """
+    config = load(preset, overrides)
+    if problems:
+        names = [f"problem {k}" if isinstance(x, BundleProblem) else str(x) for k, x in enumerate(problems)]
+        config = with_problems(config, names)
+    rules = config.game if reward is None else replace(config.game, reward=reward)
+    config = replace(config, game=rules)
+    with numerics(config.bank.dtype), process.single_blas_thread():
+        key, limit = jax.random.key(config.seed), rules.max_iterations
+        splits = make_banks(config.bank, key, config.bank.options, limit, report, rules.tolerance, problems)
+        game = make_game(rules, config.bank.classes, [x.train for x in splits], config.envs, config.step_options)
+    held_out = tuple(split.held_out for split in splits)
+    return PresetGame(*(getattr(game, name) for name in vars(game)), held_out=held_out, preset=config)
+
+
+def train(
+    env: PresetGame,
+    steps: int,
+    *,
+    seeds: int = 1,
+    seed: int = 0,
+    folder: StrPath | None = None,
+    verbose: bool = False,
+) -> LearnedPolicy:
+    """Trains agents by Soft Actor-Critic in one compiled loop; the policy that is best on training scenes.
+
+    Compare it with the best constant action before you believe in it: `jaxba-train` does.
+
+    Args:
+        env: of `make_env`.
+        steps: iterations of scenes that every agent plays, over all environments, after `loop.warmup_steps`.
+        seeds: agents that are trained side by side.
+        seed: of the agents' random numbers; the scenes are those of the environment.
+        folder: keeps log and checkpoints there, and goes on from the last one; None: they are dropped.
+        verbose: whether a line is printed after each part of the training.
+
+    Returns:
+        A policy for `jaxba.solve`, `jaxba.save_policy` and `jaxba-bench`.
+
+    Raises:
+        ValueError: an impossible number.
+        TrainError: the losses are not finite any more, or the folder holds another run.
+    """
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, not {steps}")
+    rounds = -(-steps // env.num_envs)
+    chunks = min(EVALUATIONS, rounds)
+    loop = replace(env.preset.loop, steps_per_chunk=-(-rounds // chunks))
+    config = replace(
+        env.preset, seeds=seeds, seed=seed, chunks=chunks, evaluate_every=1, checkpoint_every=chunks, loop=loop
+    )
+    work = Task(config, env, env.held_out, {})
+    show = lambda rows: print(_line(rows, chunks), flush=True)
+    hooks = driver.Hooks(rows=show) if verbose else driver.Hooks()
+    with tempfile.TemporaryDirectory() as temporary, numerics(config.bank.dtype), process.single_blas_thread():
+        outcome = driver.train(config, env, work.evaluate, Path(folder or temporary), hooks)
+    return work.policy(driver.best_of(outcome.best).actor)
+
+
+def _line(rows: list[driver.Row], chunks: int) -> str:
+    scores = ", ".join(f"{row[driver.SCORE]:.2f}" for row in rows)
+    return f"{rows[0]['chunk']}/{chunks}: {rows[0]['env_steps']} steps, iterations on training scenes {scores}"
+
+
+def gym_env(preset: str = "paper", overrides: Sequence[str] = (), **settings: Any) -> GymGame:
+    """What `gymnasium.make("jaxba/BundleAdjustment-v0")` makes: one scene at a time. Arguments as for `make_env`."""
+    from jaxba.game.gym import GymGame
+
+    return GymGame(make_env(preset, *overrides, "envs=[1]", **settings))
+
+
+def gym_vector_env(
+    num_envs: int = 64, preset: str = "paper", overrides: Sequence[str] = (), **settings: Any
+) -> GymVectorGame:
+    """The same for `gymnasium.make_vec`: many scenes in one compiled program."""
+    from jaxba.game.gym import GymVectorGame
+
+    return GymVectorGame(make_env(preset, *overrides, f"envs=[{num_envs}]", **settings))
