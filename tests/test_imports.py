@@ -40,6 +40,10 @@ LABORATORY = {"methods", "kitti", "game", "training", "peers", "bench", "paper"}
 LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper")}
 """Modules of commands that belong to them."""
 
+DOOR = ("jaxba", "jaxba.training.api")
+"""The one arrow that is not one: `jaxba` names these functions for type checkers, and loads them when they are asked
+for."""
+
 MOST_BRANCHES = 115
 """Most branches on None, and on rigs, of all rooms of the core. It only falls: a feature is a value that knows what it
 is, such as `structure.sharing.Sharing`, so that its users need not ask."""
@@ -80,7 +84,7 @@ def turned_arrows(room: str, sources: dict[str, str]) -> list[str]:
         for module, source in sources.items()
         if room_of(module) == room
         for name in imports(source)
-        if room_of(name) != room and room_of(name) not in known
+        if room_of(name) != room and room_of(name) not in known and (module, name) != DOOR
     ]
 
 
@@ -97,7 +101,7 @@ def in_laboratory(module: str) -> bool:
 def test_the_library_imports_nothing_of_the_laboratory():
     library = {module: source for module, source in SOURCES.items() if not in_laboratory(module)}
     arrows = [(module, name) for module, source in library.items() for name in imports(source) if in_laboratory(name)]
-    assert arrows == []
+    assert set(arrows) <= {DOOR}
 
 
 def test_import_jaxba_loads_nothing_of_the_laboratory():
