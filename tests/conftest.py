@@ -124,6 +124,16 @@ def few_programs():
 
 
 @pytest.fixture(scope="session", autouse=True)
+def memory_is_given_back():
+    """Commands that run in this process would set it to keep all memory that it frees, until it had gigabytes."""
+    from jaxba.runtime import process
+
+    keep, process.keep_memory = process.keep_memory, lambda: False
+    yield
+    process.keep_memory = keep
+
+
+@pytest.fixture(scope="session", autouse=True)
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation up to two hundred times slower: they wait
     by spinning."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_game import AGENT, KIND, RULES, tiny_bank
 
-from benchmarks.look_ahead import look_ahead, play_on
+from benchmarks.foresight import look_ahead, play_on
 from jaxba.damping.learned import ConstantAction
 from jaxba.game.env import make_game
 from jaxba.game.rollout import play
