@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -53,9 +53,8 @@ RACE_SHARE = 0.65
 """Share of the time for the race; the rest is for the held-out windows."""
 
 EVALUATION_S, POINT_S = 2e-8, 4e-8
-"""Seconds per observation of a cost and of an embedded point iteration, of `choose.SECONDS`. Measured on Ladybug-49:
-0.6 ms, and 3.9 ms for three (`python -m benchmarks.phases`). A camera round takes about as long as a point iteration
-more."""
+"""Seconds per observation of a cost and of an embedded point iteration. Measured on Ladybug-49: 0.6 ms, and 3.9 ms for
+three (`python -m benchmarks.phases`). A repair with a camera round takes about a point iteration more."""
 
 
 class Candidate(NamedTuple):
@@ -108,16 +107,8 @@ class Played(NamedTuple):
     cost: float  # at the end, pixels^2; infinite if it did not converge
 
 
-Play = Callable[[Candidate, Window], Played]
-"""Solves a window with some settings; `play`, but for tests."""
-
-
-class Row(NamedTuple):
-    """A candidate in the last round of a race."""
-
-    candidate: Candidate
-    failures: int
-    ratio: tuple[float, float, float]  # price over that of the default, and its 95% interval
+Row = tuple[Candidate, int, tuple[float, float, float]]
+"""A candidate in a round of a race: its failures, and its price over that of the default with its 95% interval."""
 
 
 class Found(NamedTuple):
@@ -125,15 +116,14 @@ class Found(NamedTuple):
 
     chosen: Candidate  # the winner if it is better than the default, else the default
     winner: Candidate
-    held_out: tuple[float, float, float]  # its price over that of the default, and its 95% interval
+    held_out: tuple[float, float, float]  # its price over that of the default, and its 95% interval; or NaN
     windows: tuple[int, int]  # raced on, held out
     rows: list[Row]  # the last round, the best first
     in_time: bool  # whether the clock has cut nothing off
 
-    @property
-    def better(self) -> bool:
-        """Whether something is better than the default."""
-        return self.chosen != DEFAULT
+
+Play = Callable[[Candidate, Window], Played]
+"""Solves a window with some settings; `play`, but for tests."""
 
 
 def windows_of(paths: Sequence[str], count: int, seed: int) -> tuple[list[Window], list[Window]]:
@@ -186,23 +176,22 @@ def play(candidate: Candidate, part: Window) -> Played:
 
 def prices(
     played: Mapping[Candidate, Sequence[Played]], windows: Sequence[Window], within: float
-) -> tuple[dict[Candidate, Float[np.ndarray, " windows"]], dict[Candidate, int]]:
-    """The price of each window, and the number of failures.
-
-    A solve has failed that has not converged, or whose cost is more than `within` above the lowest one of all
-    candidates, relatively. It costs as much as `MAX_ITERATIONS` iterations of the default, and none costs more.
-    """
-    cost = {one: np.array([solve.cost for solve in solves]) for one, solves in played.items()}
-    lowest = np.full(len(windows), np.inf)
-    for values in cost.values():
-        lowest[: len(values)] = np.minimum(lowest[: len(values)], values)
-    limit, found, failures = np.array([part.price(MAX_ITERATIONS) for part in windows]), {}, {}
+) -> dict[Candidate, Float[np.ndarray, " windows"]]:
+    """The price of each window. A solve has failed that has not converged, or that ends more than `within` above the
+    lowest cost of all candidates, relatively. It costs as much as `MAX_ITERATIONS` iterations, and none costs more."""
+    lowest, found = np.full(len(windows), np.inf), {}
+    for solves in played.values():
+        lowest[: len(solves)] = np.minimum(lowest[: len(solves)], [solve.cost for solve in solves])
     for one, solves in played.items():
-        own = np.array([solve.price for solve in solves])
-        failed = ~(np.isfinite(cost[one]) & (cost[one] <= lowest[: len(own)] * (1 + within)))
-        found[one] = np.where(failed, np.inf, own).clip(max=limit[: len(own)])
-        failures[one] = int(failed.sum())
-    return found, failures
+        price, cost = np.array(solves).T
+        failed = ~(np.isfinite(cost) & (cost <= lowest[: len(cost)] * (1 + within)))
+        found[one] = np.where(failed, np.inf, price).clip(max=failure(windows[: len(cost)]))
+    return found
+
+
+def failure(windows: Sequence[Window]) -> Float[np.ndarray, " windows"]:
+    """The price of a failure on each window."""
+    return np.array([part.price(MAX_ITERATIONS) for part in windows])
 
 
 def race(
@@ -211,42 +200,23 @@ def race(
     within: float,
     played: dict[Candidate, list[Played]],
     play: Play,
-    more: Callable[[], bool],
-    report: Callable[[str], None],
-) -> list[Row]:
-    """Rounds of `ROUND` windows each, until the best one and the default are alone, or the windows or the time end.
-
-    Args:
-        candidates: with the default.
-        windows: to race on.
-        within: as for `prices`.
-        played: solves of earlier races on the first windows; it is added to.
-        play: solves a window.
-        more: whether there is time for another solve.
-        report: called with a line after each round.
-
-    Returns:
-        The candidates of the last complete round, the best first; none if there is no complete round.
-    """
-    alive, rows = list(dict.fromkeys(candidates)), []
+) -> Iterator[list[Row]]:
+    """Rounds of `ROUND` windows each, until the best one and the default are alone or the windows end. Gives the
+    candidates of each round, the best first. `played` has solves of earlier races, and is added to."""
+    alive = list(dict.fromkeys(candidates))
     for end in range(ROUND, len(windows) + 1, ROUND):
         for one in alive:
             solves = played.setdefault(one, [])
-            while len(solves) < end:
-                if not more():
-                    return rows
-                solves.append(play(one, windows[len(solves)]))
-        cost, _ = prices(played, windows, within)
-        _, failures = prices({one: solves[:end] for one, solves in played.items()}, windows, within)
+            solves.extend(play(one, part) for part in windows[len(solves) : end])
+        cost = prices(played, windows, within)
         seen = {one: cost[one][:end] for one in alive}
         alive.sort(key=lambda one: geometric_mean(seen[one]))
-        rows = [Row(one, failures[one], paired_ratio(seen[one], seen[DEFAULT])) for one in alive]
+        failures = {one: int(np.sum(seen[one] >= failure(windows[:end]))) for one in alive}
+        yield [(one, failures[one], paired_ratio(seen[one], seen[DEFAULT])) for one in alive]
         best = alive[0]
         alive = [one for one in alive if one in (DEFAULT, best) or paired_ratio(seen[one], seen[best])[1] <= 1]
-        report(f"{end} windows, {len(rows)} settings: best {best}, {rows[0].ratio[0]:.2f} of the default's price")
         if len(alive) <= 2 and alive[-1] == DEFAULT:
-            break
-    return rows
+            return
 
 
 def tune(
@@ -263,38 +233,40 @@ def tune(
         seconds: after which no solve begins any more.
         within: a solve fails that ends further above the best known cost, relatively.
         play: solves a window.
-        report: called with a line of progress.
+        report: called with a line of progress after each round.
     """
-    began, cut, played = time.perf_counter(), [], {}
+    began, in_time = time.perf_counter(), True
 
-    def until(share: float) -> Callable[[], bool]:
-        def more() -> bool:
-            late = time.perf_counter() - began > share * seconds
-            cut.extend([True] * late)
-            return not late
+    def until(share: float) -> Play:
+        def timed(candidate: Candidate, part: Window) -> Played:
+            if time.perf_counter() - began > share * seconds:
+                raise TimeoutError
+            return play(candidate, part)
 
-        return more
+        return timed
 
-    winner, rows = DEFAULT, []
+    winner, rows, played, apart = DEFAULT, [], {}, {}
     lambdas = lambda best: [best._replace(policy=f"{GUARDED}:{value:g}") for value in LAMBDAS]
     gains = lambda best: [best._replace(min_gain=value) for value in GAINS]
     steps = lambda best: [*(best._replace(refine_points=k, repairs=kind) for k, kind in STEPS), *RULES]
-    for stage in (lambdas, gains, steps):
-        raced = race([DEFAULT, winner, *stage(winner)], windows[0], within, played, play, until(RACE_SHARE), report)
-        rows = raced or rows
-        winner = rows[0].candidate if rows else DEFAULT
-    ratio, count = (1.0, 1.0, 1.0), 0
+    try:
+        for stage in (lambdas, gains, steps):
+            for rows in race([DEFAULT, winner, *stage(winner)], windows[0], within, played, until(RACE_SHARE)):
+                (winner, _, (ratio, *_)), done = rows[0], len(played[DEFAULT])
+                report(f"{done} windows, {len(rows)} settings: best {winner}, {ratio:.2f} of the default")
+    except TimeoutError:
+        in_time = False
+    ratio, chosen = (np.nan, np.nan, np.nan), DEFAULT
     if winner != DEFAULT:
-        more, apart = until(1.0), {winner: [], DEFAULT: []}
-        for part in windows[1]:
-            if not more():
-                break
-            for one, solves in apart.items():
-                solves.append(play(one, part))
-            count += 1
-        if count >= ROUND:
-            cost, _ = prices(apart, windows[1][:count], within)
+        apart = {winner: [], DEFAULT: []}
+        try:
+            for part in windows[1]:
+                for one, solve in [(one, until(1.0)(one, part)) for one in apart]:
+                    apart[one].append(solve)
+        except TimeoutError:
+            in_time = False
+        if len(apart[DEFAULT]) >= ROUND:
+            cost = prices(apart, windows[1], within)
             ratio = paired_ratio(cost[winner], cost[DEFAULT])
-    chosen = winner if ratio[2] < 1 else DEFAULT
-    raced_on = max(map(len, played.values()), default=0)
-    return Found(chosen, winner, ratio, (raced_on, count), rows, not cut)
+            chosen = winner if ratio[2] < 1 else DEFAULT
+    return Found(chosen, winner, ratio, (len(played.get(DEFAULT, ())), len(apart.get(DEFAULT, ()))), rows, in_time)

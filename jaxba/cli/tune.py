@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from jaxba.cli import common
 from jaxba.cli.options import options
-
-if TYPE_CHECKING:
-    from jaxba.bench.tables import Table
-    from jaxba.bench.tuning import Found
 
 MOST_SECONDS = 300.0
 """Longest race."""
@@ -59,7 +55,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def _tune(args: Arguments, command: str) -> int:
     from jaxba.bench import tuning
-    from jaxba.bench.tables import to_rich
+    from jaxba.bench.tables import Table, to_rich
     from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
     from jaxba.datasets.bal.paths import resolve
     from jaxba.runtime.atomic import write_text
@@ -77,7 +73,10 @@ def _tune(args: Arguments, command: str) -> int:
         windows = tuning.windows_of(paths, args.windows, args.seed)
     found = tuning.tune(windows, args.seconds, args.within, report=common.print_line)
     if found.rows:
-        common.console(FILE_WIDTH).print(to_rich(_table(found)))
+        cells = [(str(one), str(count), "{:.3f} [{:.3f}, {:.3f}]".format(*ratio)) for one, count, ratio in found.rows]
+        header = ("settings", "failures", "price over the default's [95%]")
+        title = f"Last round of the race, on {found.windows[0]} windows"
+        common.console(FILE_WIDTH).print(to_rich(Table(title, header, cells, "Price: predicted time of the file.")))
     line = verdict(found)
     common.print_line(line)
     if not found.in_time:
@@ -91,24 +90,15 @@ def _tune(args: Arguments, command: str) -> int:
     return 0
 
 
-def verdict(found: Found) -> str:
+def verdict(found: Any) -> str:
     """What was found, in one line."""
-    price = "{:.2f} [{:.2f}, {:.2f}] of its price".format(*found.held_out)
-    where = f"on {common.counted(found.windows[1], 'held-out window')}"
-    if found.better:
-        return f"better than the default: {found.chosen}, {price} {where}"
+    price = "{:.2f} [{:.2f}, {:.2f}] of its price on {}".format(
+        *found.held_out, common.counted(found.windows[1], "held-out window")
+    )
+    if found.held_out[2] < 1:
+        return f"better than the default: {found.chosen}, {price}"
     why = "no other won the race" if found.rows else "there was no time for a round"
     if found.winner != found.chosen:
-        why = f"the best other, {found.winner}, has {price} {where}"
+        late = f"there was no time to hold {found.winner} against it"
+        why = f"the best other, {found.winner}, has {price}" if found.held_out[2] >= 1 else late
     return f"nothing is better than the default: {why}"
-
-
-def _table(found: Found) -> Table:
-    from jaxba.bench.tables import Table
-
-    cells = lambda row: (str(row.candidate), str(row.failures), "{:.3f} [{:.3f}, {:.3f}]".format(*row.ratio))
-    note = "Price: predicted time of the whole file. Those that were significantly worse have left before."
-    title = f"Last round of the race, on {found.windows[0]} windows"
-    return Table(
-        title, ("settings", "failures", "price over the default's [95%]"), [cells(r) for r in found.rows], note
-    )

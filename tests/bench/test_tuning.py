@@ -45,7 +45,7 @@ def test_the_known_best_setting_of_a_family_is_found():
 def test_the_default_stays_to_the_end_of_a_race_and_what_is_far_worse_leaves_after_a_round():
     family = Family(repairs=5.0)
     found = tune(WINDOWS, 60.0, play=family)
-    assert DEFAULT in [row.candidate for row in found.rows]
+    assert DEFAULT in [one for one, _, _ in found.rows]
     assert {count for one, count in family.calls.items() if one.repairs == BEST.repairs} == {ROUND}
     assert family.calls[DEFAULT] >= 24
 
@@ -70,10 +70,9 @@ def test_a_solve_that_ends_too_high_or_not_at_all_costs_as_much_as_a_hundred_ite
     }
     window = Window(support.tiny(), 1.0, 0.1, 0.2)
     failed = MAX_ITERATIONS * 1.3
-    cost, failures = prices(played, [window] * 3, 1e-3)
+    cost = prices(played, [window] * 3, 1e-3)
     np.testing.assert_allclose(cost[DEFAULT], [3, 4, failed])
     np.testing.assert_allclose(cost[other], [2, failed, failed])
-    assert failures == {DEFAULT: 1, other: 2}
 
 
 def test_a_price_counts_what_a_solve_did_and_numbers_alone_compile_nothing():
