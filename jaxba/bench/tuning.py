@@ -117,7 +117,7 @@ class Found(NamedTuple):
     chosen: Candidate  # the winner if it is better than the default, else the default
     winner: Candidate
     held_out: tuple[float, float, float]  # its price over that of the default, and its 95% interval; or NaN
-    windows: tuple[int, int]  # raced on, held out
+    windows: tuple[int, int]  # of the last round, held out
     rows: list[Row]  # the last round, the best first
     in_time: bool  # whether the clock has cut nothing off
 
@@ -200,9 +200,9 @@ def race(
     within: float,
     played: dict[Candidate, list[Played]],
     play: Play,
-) -> Iterator[list[Row]]:
-    """Rounds of `ROUND` windows each, until the best one and the default are alone or the windows end. Gives the
-    candidates of each round, the best first. `played` has solves of earlier races, and is added to."""
+) -> Iterator[tuple[int, list[Row]]]:
+    """Rounds of `ROUND` windows each, until the best one and the default are alone or the windows end. Gives the number
+    of windows and the candidates of each, the best first. `played` has solves of earlier races, and is added to."""
     alive = list(dict.fromkeys(candidates))
     for end in range(ROUND, len(windows) + 1, ROUND):
         for one in alive:
@@ -212,7 +212,7 @@ def race(
         seen = {one: cost[one][:end] for one in alive}
         alive.sort(key=lambda one: geometric_mean(seen[one]))
         failures = {one: int(np.sum(seen[one] >= failure(windows[:end]))) for one in alive}
-        yield [(one, failures[one], paired_ratio(seen[one], seen[DEFAULT])) for one in alive]
+        yield end, [(one, failures[one], paired_ratio(seen[one], seen[DEFAULT])) for one in alive]
         best = alive[0]
         alive = [one for one in alive if one in (DEFAULT, best) or paired_ratio(seen[one], seen[best])[1] <= 1]
         if len(alive) <= 2 and alive[-1] == DEFAULT:
@@ -245,15 +245,15 @@ def tune(
 
         return timed
 
-    winner, rows, played, apart = DEFAULT, [], {}, {}
+    winner, count, rows, played, apart = DEFAULT, 0, [], {}, {}
     lambdas = lambda best: [best._replace(policy=f"{GUARDED}:{value:g}") for value in LAMBDAS]
     gains = lambda best: [best._replace(min_gain=value) for value in GAINS]
     steps = lambda best: [*(best._replace(refine_points=k, repairs=kind) for k, kind in STEPS), *RULES]
     try:
         for stage in (lambdas, gains, steps):
-            for rows in race([DEFAULT, winner, *stage(winner)], windows[0], within, played, until(RACE_SHARE)):
-                (winner, _, (ratio, *_)), done = rows[0], len(played[DEFAULT])
-                report(f"{done} windows, {len(rows)} settings: best {winner}, {ratio:.2f} of the default")
+            for count, rows in race([DEFAULT, winner, *stage(winner)], windows[0], within, played, until(RACE_SHARE)):
+                winner, _, (ratio, *_) = rows[0]
+                report(f"{count} windows, {len(rows)} settings: best {winner}, {ratio:.2f} of the default")
     except TimeoutError:
         in_time = False
     ratio, chosen = (np.nan, np.nan, np.nan), DEFAULT
@@ -269,4 +269,4 @@ def tune(
             cost = prices(apart, windows[1], within)
             ratio = paired_ratio(cost[winner], cost[DEFAULT])
             chosen = winner if ratio[2] < 1 else DEFAULT
-    return Found(chosen, winner, ratio, (len(played.get(DEFAULT, ())), len(apart.get(DEFAULT, ()))), rows, in_time)
+    return Found(chosen, winner, ratio, (count, len(apart.get(DEFAULT, ()))), rows, in_time)
