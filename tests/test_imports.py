@@ -37,7 +37,7 @@ NO_MORE_THAN = {
 LABORATORY = {"methods", "kitti", "game", "training", "peers", "bench", "paper"}
 """Rooms that ask rather than solve. The library, which is all else, imports nothing of them."""
 
-LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper")}
+LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper", "tune")}
 """Modules of commands that belong to them."""
 
 DOOR = ("jaxba", "jaxba.training.api")

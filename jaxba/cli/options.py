@@ -5,13 +5,14 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass, field, is_dataclass, make_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+from functools import partial
 from io import StringIO
 from itertools import pairwise
 from textwrap import dedent
-from types import NoneType, UnionType
+from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import tyro
@@ -68,7 +69,11 @@ def _metavar(kind: Any) -> str | None:
 
 
 def parse(
-    arguments: type[Arguments], description: str, program: str, argv: Sequence[str] | None
+    arguments: type[Arguments],
+    description: str,
+    program: str,
+    argv: Sequence[str] | None,
+    defaults: Mapping[str, Any] = MappingProxyType({}),
 ) -> Arguments | str | None:
     """The parsed command line, or what is wrong with it, in one line; None after `--help`.
 
@@ -77,13 +82,16 @@ def parse(
         description: first line of the help.
         program: name of the command.
         argv: the command line; `sys.argv[1:]` if None.
+        defaults: values by name of options that the command line may leave out, in place of the class's own. For a
+            class that inherits its options.
     """
     groups = [base for base in arguments.__bases__ if is_dataclass(base)]
     # subclasses, without the docstrings, which tyro would print
-    parts = [
-        (base.__name__.lower(), part := type(base.__name__, (base,), {}), field(default_factory=part))
-        for base in groups
-    ]
+    parts = []
+    for base in groups:
+        part = type(base.__name__, (base,), {})
+        given = {one.name: defaults[one.name] for one in fields(base) if one.name in defaults}
+        parts.append((base.__name__.lower(), part, field(default_factory=partial(part, **given) if given else part)))
     drawn = StringIO()
     try:
         with redirect_stderr(drawn):

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ import tyro
 from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
-from jaxba.cli.options import options
+from jaxba.cli.options import options, parse
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
@@ -45,7 +46,7 @@ from jaxba.runtime.interrupt import Interrupt
 from jaxba.scenes import DEFAULT_SCENES, random_scene
 from jaxba.solver.loop import IterationRecord, Watch
 from jaxba.solver.methods import DEFAULT_METHOD
-from jaxba.solver.names import SolverName, parse_policy, split_refinement
+from jaxba.solver.names import Repairs, SolverName, adjusted, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve
@@ -120,6 +121,13 @@ class Step:
     """Point iterations after each camera step. Default: the embedded iterations of a learned policy; none for a
     rule."""
 
+    repairs: Repairs | None = None
+    """Of a bad step. none; trials: up to three shorter steps; all: camera rounds and pattern moves, too. Default: those
+    of the policy, but none with --refine-points."""
+
+    min_gain: float | None = None
+    """Gain ratio that a step must exceed. Default: that of the policy."""
+
     linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
     """explicit: factor the reduced camera system. sparse: form it for conjugate gradients. implicit: do not form it.
     cg: twelve iterations of that. auto: by size."""
@@ -144,6 +152,9 @@ class Step:
     compilation: Compilation = DEFAULTS.compilation
     """quick: compile in a third of the time, for iterations that take two to six times as long. full: the contrary.
     auto: full once that pays; on a GPU always."""
+
+    settings: Annotated[str | None, "FILE"] = None
+    """YAML file of options of this command, as jaxba-tune writes. The command line wins."""
 
 
 @options
@@ -214,7 +225,30 @@ def run(argv: Sequence[str] | None = None) -> int:
         words = translated(sys.argv[1:] if argv is None else argv)
     except common.UsageError as error:
         return common.print_error(str(error))
-    return common.run_command(Arguments, _run, "Bundle adjustment of one problem.", words)
+    main = lambda args: _run(args if args.settings is None else with_settings(args.settings, words))
+    return common.run_command(Arguments, main, "Bundle adjustment of one problem.", words)
+
+
+def with_settings(path: str, words: Sequence[str]) -> Arguments:
+    """The arguments of a command line where what it leaves out is as a file of `--settings` says.
+
+    Raises:
+        UsageError: no such file, or it has what is no option, or no value of it; one line that names the file.
+    """
+    from jaxba import settings
+    from jaxba.settings import configurations
+
+    try:
+        data = {str(key).replace("-", "_"): value for key, value in configurations.read_file(Path(path), path).items()}
+        if none := {"problem", "settings"} & set(data):
+            raise configurations.SettingsError(f"{path}: {none.pop()} stands on the command line alone")
+        given = settings.read(Arguments, data)
+    except configurations.SettingsError as error:
+        text = str(error)
+        raise common.UsageError(f"--settings {text if text.startswith(path) else f'{path}: {text}'}") from None
+    parsed = parse(Arguments, "", "jaxba-solve", words, {name: getattr(given, name) for name in data})
+    assert isinstance(parsed, Arguments)  # as without the file
+    return parsed
 
 
 def solver_name(args: Arguments) -> SolverName:
@@ -240,7 +274,7 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
         InputError: as `make_policy` and `make_method`.
     """
     try:
-        policy, options = solver_name(args).build()
+        policy, options = adjusted(*solver_name(args).build(), args.repairs, args.min_gain)
         trained = options.step_options(policy).coordinates
         scaling, rotation = args.scaling or trained.scaling, args.rotation or trained.rotation
         options = replace(
@@ -344,7 +378,8 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")
     outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
-    read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
+    read = {f"the file of --{name}": getattr(args, name) for name in ("constraints", "settings")}
+    read["the file of --policy"] = policy_file(args.policy)
     check_outputs(args.output, outputs, path, read)
     if args.view:
         common.check_extra(view.VIEWER)

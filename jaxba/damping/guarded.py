@@ -96,10 +96,6 @@ class Rescue(NamedTuple):
         return Rescue(worked, in_a_row, rejections, jnp.where(in_charge, growth, 0).astype(dtype)), following
 
 
-GUARDED_DECADES = -8.0
-"""log10 of the lambda of `Guarded`. On 512 training scenes of a game in which every part of an iteration cost its
-work, -9 was the best constant and -8 cost 0.3% more (three seeds); on real problems -8 was measured."""
-
 FREE_DESCENT = 11.0
 """Decades by which the lambda of `Guarded` may fall: the range of an action, so only from above 1e3 in two steps."""
 
@@ -107,7 +103,7 @@ FREE_DESCENT = 11.0
 @register_pytree
 @dataclass(frozen=True)
 class Guarded:
-    """Nearly Gauss-Newton, with all embedded iterations: `GUARDED_DECADES` as long as no step fails.
+    """Nearly Gauss-Newton, with all embedded iterations: `initial` as long as no step fails.
 
     A rejection raises lambda by half a decade, and so does every time that an accepted step was shortened. A step of
     full length brings it back, unless it was inexact. After two rejections in a row, or eight in all, Ceres' rule
@@ -118,21 +114,28 @@ class Guarded:
     """Gain ratio that a candidate must exceed; otherwise the step is shortened and tried again. Source: the sufficient
     decrease of trust regions (Nocedal, Wright 2006, algorithm 4.1)."""
 
+    initial: float = 1e-8
+    """Lambda until a step fails. On 512 training scenes of a game in which every part of an iteration cost its work,
+    1e-9 was the best constant and 1e-8 cost 0.3% more (three seeds); on real problems 1e-8 was measured."""
+
     def step_options(self, base: StepOptions) -> StepOptions:
         """The step of `AgentConfig`, with one point iteration."""
         return AgentConfig(refine_points=1).step_options(base)
 
     def init(self, info: ProblemInfo) -> tuple[Rescue, Array]:
         """See `DampingPolicy`."""
-        least = smallest_decades(GUARDED_DECADES, info.cost.dtype)
-        return Rescue.begin(info.cost.dtype), 10 ** jnp.asarray(least, info.cost.dtype)
+        return Rescue.begin(info.cost.dtype), 10 ** self._least(info.cost.dtype)
 
     def propose(self, state: Rescue, step: StepInfo) -> tuple[Rescue, Array]:
         """See `DampingPolicy`."""
-        least = smallest_decades(GUARDED_DECADES, state.worked.dtype)
+        least = self._least(state.worked.dtype)
         state, rescue = state.after(step, AgentConfig.patience, AgentConfig.max_rejections)
         decades = jnp.log10(step.damping).astype(state.worked.dtype)
         failures = jnp.where(step.accepted, times_shortened(step), 1.0)
         fallen = jnp.maximum(least, jnp.where(is_inexact(step), decades, decades - FREE_DESCENT))
         own = jnp.where(failures > 0, decades + AgentConfig.escalate * failures, fallen)
         return state, jnp.clip(10 ** jnp.where(state.in_charge, rescue, own), 10**least, LARGEST)
+
+    def _least(self, dtype: Any) -> Float[Array, ""]:
+        """log10 of `initial`, as far as the type can hold it."""
+        return jnp.maximum(jnp.log10(jnp.asarray(self.initial, dtype)), smallest_decades(-math.inf, dtype))

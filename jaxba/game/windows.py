@@ -27,6 +27,9 @@ HELD_OUT = 0.2
 FEWEST_CAMERAS = 4
 """Cameras of the smallest window."""
 
+MOVED = 0.5
+"""Share of the windows that begin where random scenes do."""
+
 
 def read_windows(
     problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
@@ -58,8 +61,8 @@ def read_windows(
     return stack(train), stack(held_out)
 
 
-def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
-    """The problems, in memory or files.
+def read_all(given: Sequence[StrPath | BundleProblem], held_out: float = HELD_OUT) -> list[BundleProblem]:
+    """The problems, in memory or files. `held_out` is the share of the cameras that is held out.
 
     Raises:
         ProblemError: a problem cannot be read, has whitened observations, other lenses than BAL's or too few cameras;
@@ -78,23 +81,24 @@ def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
         if problem.num_cameras < FEWEST_CAMERAS:
             raise ProblemError(f"{path}: {problem.num_cameras} cameras; a window has {FEWEST_CAMERAS} at least")
         problems.append(problem)
-    least = round(FEWEST_CAMERAS / HELD_OUT)
+    least = round(FEWEST_CAMERAS / held_out)
     if max(problem.num_cameras for problem in problems) < least:
         raise ProblemError(f"no problem has {least} cameras, so that windows in another place can be held out")
     return problems
 
 
 def places(
-    linked: Int[np.ndarray, "cameras cameras"],
+    linked: Int[np.ndarray, "cameras cameras"], held_out: float = HELD_OUT
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " held_out"]]:
     """The cameras of training and of held-out windows. In the order of a band matrix neighbours stand together, so that
     the last of them are another place.
 
     Args:
         linked: as `covisible` returns it.
+        held_out: share of the cameras.
     """
     order = reverse_cuthill_mckee(coo_array(linked).tocsr(), symmetric_mode=True).astype(np.int64)
-    first = len(order) - round(HELD_OUT * len(order))
+    first = len(order) - round(held_out * len(order))
     return order[:first], order[first:]
 
 
@@ -112,6 +116,8 @@ def window(
     linked: Int[np.ndarray, "cameras cameras"],
     allowed: Int[np.ndarray, " allowed"],
     rng: np.random.Generator,
+    fewest: int = FEWEST_CAMERAS,
+    moved: float = MOVED,
 ) -> Scenes:
     """One window, its arrays without the axis of scenes.
 
@@ -124,8 +130,11 @@ def window(
         linked: as `covisible` returns it.
         allowed: cameras to choose from.
         rng: source of random numbers.
+        fewest: cameras of the smallest window, if there are as many.
+        moved: share of the windows whose start is moved.
     """
-    size = int(rng.integers(FEWEST_CAMERAS, min(kind.cameras, len(allowed)) + 1))
+    most = min(kind.cameras, len(allowed))
+    size = int(rng.integers(min(fewest, most), most + 1))
     chosen = [int(rng.choice(allowed))]
     while len(chosen) < size:
         rest = np.setdiff1d(allowed, chosen)
@@ -137,7 +146,7 @@ def window(
     grid &= (grid.sum(axis=1) >= MIN_VIEWS)[:, None]
     grid &= (grid.sum(axis=0) >= 2)[None]
     cameras, start = np.array(problem.cameras)[chosen], np.array(problem.points)[points]
-    if rng.random() < 0.5:
+    if rng.random() < moved:
         cameras, start = _moved(cameras, start, rng)
     wide = lambda x, shape: np.zeros(shape, x.dtype)
     c, p = len(chosen), len(points)

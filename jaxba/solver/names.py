@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from jaxba.damping import DampingPolicy, brings_embedded, make_policy
 from jaxba.damping.agent_config import AgentConfig
@@ -21,6 +21,9 @@ from jaxba.typing import InputError
 
 DTYPES = get_args(Dtype)
 """Known floating point types; the first is the default."""
+
+Repairs = Literal["none", "trials", "all"]
+"""What is done about a step that is not good enough: nothing; shorter steps; camera rounds and pattern moves, too."""
 
 INNER = "-inner"
 """Suffix of a peer's mode with inner iterations, the peer's own embedded iterations."""
@@ -82,6 +85,28 @@ class SolverName:
         return policy, SolveOptions(
             method=self.method, refinement=step.refinement, coordinates=step.coordinates, dtype=self.dtype
         )
+
+
+def adjusted(
+    policy: Any, options: SolveOptions, repairs: Repairs | None, min_gain: float | None
+) -> tuple[DampingPolicy, SolveOptions]:
+    """What `SolverName.build` returns, with other repairs and another smallest gain ratio. None: as they are.
+
+    Raises:
+        ValueError: `min_gain` is not in [0, 1).
+    """
+    if repairs is not None:
+        points = 0 if options.refinement is None else options.refinement.points
+        whole = AgentConfig(refine_points=points).step_options(StepOptions()).refinement
+        found = {"none": Refinement(points=points), "trials": replace(whole, camera_rounds=0, pattern_moves=0)}
+        options = replace(options, refinement=found.get(repairs, whole))
+    if min_gain is not None:
+        if not 0 <= min_gain < 1:
+            raise ValueError(f"min_gain must be at least 0 and below 1, is {min_gain}")
+        agent = getattr(policy, "config", None)
+        changed = {"min_gain": min_gain} if agent is None else {"config": replace(agent, min_gain=min_gain)}
+        policy = replace(policy, **changed)
+    return policy, options
 
 
 def split_refinement(name: str) -> tuple[str, int | None, bool]:

@@ -21,7 +21,7 @@ from support import solve
 
 from jaxba import Refinement, SolveOptions, StepOptions, read_bal, read_problem, write_bal, write_bundler
 from jaxba.cli import table
-from jaxba.cli.solve import Arguments, run, solve_options
+from jaxba.cli.solve import Arguments, run, solve_options, with_settings
 from jaxba.io import json_lines
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates
@@ -45,6 +45,44 @@ def tiny(tmp_path) -> Path:
 def rows(text: str) -> list[list[str]]:
     """Lines of the iteration table."""
     return [line.split() for line in text.splitlines() if line[:4].strip().isdigit()]
+
+
+# Settings
+
+
+def test_a_file_of_settings_stands_in_for_what_the_command_line_leaves_out(tiny, tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("policy: guarded:1e-5\nrefine-points: 2\nrepairs: trials\nmin_gain: 1e-2\n")
+    args = with_settings(str(path), [str(tiny), "--refine-points", "3"])
+    policy, options = solve_options(args)
+    assert (policy.initial, policy.min_gain) == (1e-5, 1e-2)
+    rays = Refinement(points=3, starts="rays", trials=4, previous_steps=3)
+    assert options.refinement == rays
+    assert run([str(tiny), "--settings", str(path), "--output", str(path)]) == 2
+    assert solve_options(replace(args, repairs="none"))[1].refinement == Refinement(points=3)
+    assert solve_options(Arguments(repairs="all"))[1] == solve_options(Arguments())[1]
+    assert solve_options(Arguments(policy="learned", min_gain=0.5))[0].min_gain == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("polcy: ceres", "policy"),
+        ("repairs: 3", "repairs"),
+        ("problem: x", "problem"),
+        ("- ceres", "mapping"),
+        ("min_gain: 1", "--min-gain"),
+        (None, "No such file"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_in_one_line(text, named, tiny, tmp_path, capsys):
+    path = tmp_path / "settings.yaml"
+    if text is not None:
+        path.write_text(text)
+    assert run([str(tiny), "--settings", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert named in said
 
 
 # Solves

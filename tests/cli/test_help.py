@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 LINES = {
-    "solve": 130,
+    "solve": 138,
     "bench": 44,
     "data": 20,
     "data download": 26,
@@ -17,6 +17,7 @@ LINES = {
     "kitti evaluate": 24,
     "paper": 26,
     "train": 52,
+    "tune": 26,
     "view": 30,
 }
 """Most lines of the help of each command on 80 columns."""

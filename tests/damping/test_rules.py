@@ -166,6 +166,8 @@ def test_guarded_is_at_one_lambda_until_a_step_fails_and_half_a_decade_higher_fo
     inexact, pattern = {"forcing": 0.1, "damping_fraction": 9e-3}, {"step_fraction": 2.0}
     found = played(make_policy("guarded"), full, rejected, full, shortened, inexact, pattern, full)
     np.testing.assert_allclose(found, [-8, -8, -7.5, -8, -7, -7, -8, -8], atol=1e-12)
+    above = played(make_policy("guarded:1e-5"), full, rejected, full, shortened, inexact, pattern, full)
+    np.testing.assert_allclose(above, np.array(found) + 3, atol=1e-12)
     twice = played(make_policy("guarded"), shortened, shortened, rejected, full)
     np.testing.assert_allclose(twice, [-8, -7, -6, -5.5, -8], atol=1e-12)
 
