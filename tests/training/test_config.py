@@ -77,6 +77,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
+    assert found.step_options.linear_solver == "cg"
     assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
     assert found.game.max_iterations == 100
 
