@@ -88,7 +88,7 @@ class TrainConfig:
         plain = StepOptions(self.linear_solver, intrinsics=self.bank.intrinsics)
         if self.linear_solver == "cg":
             unknowns = (9 if self.bank.intrinsics == "free" else 6) * max(kind.cameras for kind in self.bank.classes)
-            rule = ConjugateGradients("schur-jacobi", budget=CG_ROUNDS * unknowns)
+            rule = ConjugateGradients("schur-jacobi", forcing=0.0, budget=CG_ROUNDS * unknowns)
             plain = replace(plain, conjugate_gradients=rule)
         method = make_method(self.method)
         if method.cluster_cameras is not None:

@@ -11,13 +11,11 @@ from jaxba.training.log import Row
 YARDSTICKS = ("ceres", "ceres+embedded", "constant action")
 """Baselines beside which held-out scores are printed."""
 
-
 MOST_ENTROPY = math.log(2)
 """Nats of a uniform action in (-1, 1)."""
 
 RANDOM = 0.05
-"""A policy with less than this below `MOST_ENTROPY` is called random: on average 3% of the probability is elsewhere
-than under a uniform policy."""
+"""Nats; a policy whose entropy is less than this below `MOST_ENTROPY` acts at random."""
 
 SAME = 0.1
 """Decades of lambda; a policy with a smaller spread over states does the same in every state."""
