@@ -254,7 +254,7 @@ def _seconds_to(problem: BundleProblem, name: str, target: float, repeats: int) 
     return statistics.median(seconds for _, seconds in solves)
 
 
-def scene_throughput(repeats: int) -> Iterator[Metric]:
+def scene_throughput(repeats: int, scenes: int = 256) -> Iterator[Metric]:
     """LM steps per second on scenes of 10 cameras and 10 points, all in one vmapped program: with free lenses, and as
     the game of the paper has them, with dense algebra and with conjugate gradients."""
     import jax
@@ -263,7 +263,7 @@ def scene_throughput(repeats: int) -> Iterator[Metric]:
     import jaxba
     from jaxba.training.config import load
 
-    scenes, game = 256, load("paper").step_options
+    game = load("paper").step_options
     dense = dataclasses.replace(game, linear_solver="explicit")
     with jax.enable_x64(True):
         problems = [jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(scenes)]

@@ -14,8 +14,9 @@ YARDSTICKS = ("ceres", "ceres+embedded", "constant action")
 MOST_ENTROPY = math.log(2)
 """Nats of a uniform action in (-1, 1)."""
 
-RANDOM = 0.05
-"""Nats; a policy whose entropy is less than this below `MOST_ENTROPY` acts at random."""
+RANDOM = 0.1
+"""Nats; a policy whose entropy is less than this below `MOST_ENTROPY` acts at random: as if over nine tenths of the
+range."""
 
 SAME = 0.1
 """Decades of lambda; a policy with a smaller spread over states does the same in every state."""
@@ -25,7 +26,7 @@ def lines(
     rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool = False, decades: float = 5.5
 ) -> list[str]:
     """A line on a finished chunk and one on the agents' health, and one on held-out scores if there are any. The last
-    one is a warning if there are scores, and some agents have learned nothing.
+    one is a warning if there are scores, and some agents' policies are the same everywhere or random.
 
     Args:
         rows: of the chunk in the log, one of every agent.
@@ -77,7 +78,7 @@ def _warning(rows: Sequence[Row], decades: float) -> list[str]:
     if random:
         values = ", ".join(f"{row['entropy']:.2f}" for row in random)
         found.append(f"{who(random)} {does(random)} anything at random (entropy {values} of {MOST_ENTROPY:.2f} nats)")
-    return [f"nothing learned: {'; '.join(found)}"] if found else []
+    return [f"warning: {'; '.join(found)}"] if found else []
 
 
 def _mean(rows: Sequence[Row], name: str) -> float:

@@ -41,7 +41,7 @@ def test_a_chunk_has_a_line_and_its_held_out_scores_another():
     assert second.endswith(", failures 1.0 % (ceres 6.00, ceres+embedded 5.00), best so far")
     spread = "spread of log10(lambda) over states"
     assert health.endswith(f"critics' loss 0.25, bias +0.5 of -2, entropy -0.50 nats, {spread} 0.00, 0.60, 1.20")
-    assert warning == f"nothing learned: 1 of 3 policies do the same in every state ({spread} 0.00)"
+    assert warning == f"warning: 1 of 3 policies do the same in every state ({spread} 0.00)"
     assert len(view.lines(rows(2), 4, RULES)) == 2
 
 
