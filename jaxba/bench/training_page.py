@@ -31,6 +31,9 @@ LEARNING = {
     "critic_loss": "loss of the critics",
     "actor_loss": "loss of the actor",
     "q_mean": "value of the critics",
+    "q_bias": "bias of the critics",
+    "entropy": "entropy (nats; a uniform policy has 0.69)",
+    "action_spread": "spread of the mean action over states",
     "temperature": "temperature",
     "steps_per_s": "steps/s",
 }

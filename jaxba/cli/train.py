@@ -38,8 +38,8 @@ class Run:
     """What is trained, and where."""
 
     config: Annotated[str | None, "NAME"] = None
-    """Preset (default, plain, driver, fast, paper; bal and kitti with --problems) or YAML file. A resumed run has its
-    configuration in its folder."""
+    """Preset (default, plain, driver, fast, paper, paper-tuned; bal and kitti with --problems) or YAML file. A resumed
+    run has its configuration in its folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...],
@@ -147,7 +147,9 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
                 best[:] = [one.chunk for one in policies]
 
             def show(rows: list[Any]) -> None:
-                for line in view.lines(rows, config.chunks, work.rules, rows[0]["chunk"] in best):
+                agent = config.game.agent
+                decades = (agent.high - agent.low) / 2
+                for line in view.lines(rows, config.chunks, work.rules, rows[0]["chunk"] in best, decades):
                     console.print(line)
 
             hooks = driver.Hooks(console.print, show, keep, lambda: interrupt.requested)

@@ -19,7 +19,6 @@ from jaxba.game.scene_bank import Bank, Split, select
 from jaxba.paper import real_problems
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.options import StepOptions
 from jaxba.settings import to_yaml
 from jaxba.training import config as train_configs
 from jaxba.training import driver, task
@@ -158,8 +157,7 @@ def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Ban
     """The game in which an agent is trained."""
     if agent.few_scenes:
         train_on = select(train_on, np.arange(min(config.agents.trajectories, len(train_on.initial_cost))))
-    options = StepOptions(intrinsics=settings.bank.intrinsics)
-    return make_game(settings.game, settings.bank.classes, [train_on], settings.envs, options)
+    return make_game(settings.game, settings.bank.classes, [train_on], settings.envs, settings.step_options)
 
 
 def _shared_scenes(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> Split:

@@ -153,6 +153,18 @@ def act(
     return networks.squash(mean) if key is None else networks.sample_action(mean, log_std, key)[0]
 
 
+def act_with_value(
+    config: SacConfig, learner: Learner, observation: Float[Array, "envs features"], key: Array
+) -> tuple[Float[Array, "envs actions"], Float[Array, " envs"], Float[Array, " envs"]]:
+    """A sampled action as by `act`, the critics' mean value of it, and its reward for entropy."""
+    public = observation[:, : networks.input_size(learner.actor)]
+    actions = networks.action_size(learner.actor, config.policy_layers)
+    mean, log_std = _actor(config, actions).apply(learner.actor, public)
+    action, log_prob = networks.sample_action(mean, log_std, key)
+    values = _critic(config).apply(learner.critic, observation if config.privileged else public, action)
+    return action, jnp.mean(values, axis=0), -jnp.exp(learner.log_temperature) * log_prob
+
+
 def update(
     config: SacConfig, learner: Learner, batch: Transition, devices: int = 1
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:

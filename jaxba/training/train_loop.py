@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.game.devices import AXIS
 from jaxba.game.protocol import Environment, Step
@@ -143,13 +143,15 @@ def run_chunk(
 
     Returns:
         The state after the chunk, and means over it: those of `sac.update`; `reward` of a step; `action_mean`,
-        `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean of a metric of the
+        `action_std`; `action_spread`, the standard deviation of the mean action over replayed states; `q_bias`, what
+        the critics expected more than what came, entropy included, in episodes that were terminated (NaN if none was);
+        `episodes`, the number of episodes that ended, and `episode/NAME`, the mean of a metric of the
         environment over them (0 if none ended); `dropped`, transitions with numbers that are not finite.
     """
 
-    def body(state: LoopState, _: None) -> tuple[LoopState, tuple[dict[str, Array], dict[str, Array], Array]]:
+    def body(state: LoopState, _: None) -> tuple[LoopState, tuple[Any, ...]]:
         key, act_key, sample_key = jax.random.split(state.key, 3)
-        action = agent.act(sac, state.learner.actor, state.observation, act_key)
+        action, value, bonus = agent.act_with_value(sac, state.learner, state.observation, act_key)
         state, step = _play(env, state._replace(key=key), action)
         sample = lambda key: ring.sample(state.replay, key, sac.batch, env.devices)
         learn = lambda learner, key: agent.update(sac, learner, sample(key), env.devices)
@@ -162,18 +164,46 @@ def run_chunk(
         means["action_square"] = jnp.mean(action**2)
         ended = step.terminated | step.truncated
         sums = {name: jnp.sum(jnp.where(ended, x, 0), dtype=jnp.float32) for name, x in step.metrics.items()}
-        return state, (means, sums, jnp.sum(ended, dtype=jnp.float32))
+        judged = _Judged(value, bonus, jnp.asarray(step.reward, jnp.float32), step.terminated, ended)
+        return state, (means, sums, jnp.sum(ended, dtype=jnp.float32), judged)
 
     dropped = state.replay.dropped
-    state, (means, sums, ended) = jax.lax.scan(body, state, None, length=loop.steps_per_chunk)
+    state, (means, sums, ended, judged) = jax.lax.scan(body, state, None, length=loop.steps_per_chunk)
     metrics = {name: jnp.mean(values) for name, values in means.items()}
     variance = metrics.pop("action_square") - metrics["action_mean"] ** 2
     metrics["action_std"] = jnp.sqrt(jnp.maximum(variance, 0))
+    seen = ring.sample(state.replay, jax.random.fold_in(state.key, 0), sac.batch).observation
+    metrics["action_spread"] = jnp.mean(jnp.std(agent.act(sac, state.learner.actor, seen, None), axis=0))
+    metrics["q_bias"] = _bias(judged, sac.gamma)
     metrics["dropped"] = jnp.asarray(state.replay.dropped - dropped, jnp.float32)
     metrics["episodes"] = jnp.sum(ended)
     for name, values in sums.items():
         metrics[f"episode/{name}"] = jnp.sum(values) / jnp.maximum(metrics["episodes"], 1)
     return state, metrics
+
+
+class _Judged(NamedTuple):
+    """What the critics said of the actions of a chunk, and what came of them."""
+
+    value: Float[Array, "steps envs"]
+    bonus: Float[Array, "steps envs"]  # for the entropy of the action
+    reward: Float[Array, "steps envs"]
+    terminated: Bool[Array, "steps envs"]
+    ended: Bool[Array, "steps envs"]
+
+
+def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
+    """Mean value less the return that followed, over the actions whose episode was terminated within the chunk."""
+
+    def back(after: tuple[Array, Array], one: _Judged) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        future, known = after
+        found = one.reward + gamma * jnp.where(one.ended, 0, future)
+        known = one.terminated | (known & ~one.ended)
+        return (found + one.bonus, known), (jnp.where(known, one.value - found, 0), known)
+
+    zero = jnp.zeros_like(judged.reward[0])
+    _, (errors, known) = jax.lax.scan(back, (zero, zero > 0), judged, reverse=True)
+    return jnp.sum(errors) / jnp.sum(known, dtype=jnp.float32)
 
 
 @functools.partial(jit, static_argnames=("sac", "loop", "mesh"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,15 +11,29 @@ from jaxba.training.log import Row
 YARDSTICKS = ("ceres", "ceres+embedded", "constant action")
 """Baselines beside which held-out scores are printed."""
 
+MOST_ENTROPY = math.log(2)
+"""Nats of a uniform action in (-1, 1)."""
 
-def lines(rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool = False) -> list[str]:
-    """A line on a finished chunk, and one on its held-out scores if it has any.
+RANDOM = 0.1
+"""Nats; a policy whose entropy is less than this below `MOST_ENTROPY` acts at random: as if over nine tenths of the
+range."""
+
+SAME = 0.1
+"""Decades of lambda; a policy with a smaller spread over states does the same in every state."""
+
+
+def lines(
+    rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool = False, decades: float = 5.5
+) -> list[str]:
+    """A line on a finished chunk and one on the agents' health, and one on held-out scores if there are any. The last
+    one is a warning if there are scores, and some agents' policies are the same everywhere or random.
 
     Args:
         rows: of the chunk in the log, one of every agent.
         chunks: of the whole training.
         rules: a `Score` by name of the baseline.
         best: whether a policy of this chunk is the best so far.
+        decades: of lambda that an action of 1 is above 0.
     """
     row = rows[0]
     start, end = f"chunk {row['chunk']}/{chunks}: ", row["wall_s"] / row["chunk"] * chunks
@@ -26,7 +41,7 @@ def lines(rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool
     if ended := [one for one in rows if one["episodes"]]:
         length, rule = _mean(ended, "episode/length"), _mean(ended, "episode/ceres")
         text += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
-    found = [f"{start}{text}, {row['wall_s']:.0f} s of {end:.0f}"]
+    found = [f"{start}{text}, {row['wall_s']:.0f} s of {end:.0f}", start + _health(rows, decades)]
     values = [one["held_out/score"] for one in rows if one.get("held_out/score") is not None]
     if values:
         text = f"held out {_mean(rows, 'held_out/score'):.2f} iterations"
@@ -35,7 +50,35 @@ def lines(rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool
         shown = [f"{name} {rules[name].mean:.2f}" for name in YARDSTICKS if name in rules]
         text += f" ({', '.join(shown)})" if shown else ""
         found.append(f"{start}{text}{', best so far' if best else ''}")
+        found += _warning(rows, decades)
     return found
+
+
+def _health(rows: Sequence[Row], decades: float) -> str:
+    bias = [row["q_bias"] for row in rows if row["q_bias"] is not None]
+    found = f"critics' loss {_mean(rows, 'critic_loss'):.2g}"
+    found += f", bias {_mean(rows, 'q_bias'):+.2g} of {_mean(rows, 'q_mean'):.2g}" if bias else ""
+    return f"{found}, entropy {_mean(rows, 'entropy'):.2f} nats, {_spread(rows, decades)}"
+
+
+def _spread(rows: Sequence[Row], decades: float) -> str:
+    values = ", ".join(f"{decades * row['action_spread']:.2f}" for row in rows)
+    return f"spread of log10(lambda) over states {values}"
+
+
+def _warning(rows: Sequence[Row], decades: float) -> list[str]:
+    """What is said if some agents do the same in every state, or anything in every state."""
+    same = [row for row in rows if decades * row["action_spread"] < SAME]
+    random = [row for row in rows if row["entropy"] > MOST_ENTROPY - RANDOM]
+    who = lambda some: "this policy" if len(rows) == 1 else f"{len(some)} of {len(rows)} policies"
+    does = lambda some: "does" if len(rows) == 1 else "do"
+    found = []
+    if same:
+        found.append(f"{who(same)} {does(same)} the same in every state ({_spread(same, decades)})")
+    if random:
+        values = ", ".join(f"{row['entropy']:.2f}" for row in random)
+        found.append(f"{who(random)} {does(random)} anything at random (entropy {values} of {MOST_ENTROPY:.2f} nats)")
+    return [f"warning: {'; '.join(found)}"] if found else []
 
 
 def _mean(rows: Sequence[Row], name: str) -> float:

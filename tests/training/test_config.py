@@ -33,7 +33,7 @@ def refused(*overrides: str, name: str = "default") -> str:
 
 
 def test_the_presets_are_those_that_the_documentation_names():
-    assert {"default", "fast", "paper"} <= set(configurations.names("train"))
+    assert {"default", "fast", "paper", "paper-tuned"} <= set(configurations.names("train"))
 
 
 @pytest.mark.parametrize("name", configurations.names("train"))
@@ -77,8 +77,20 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
+    assert found.step_options.linear_solver == "cg"
+    assert found.step_options.truncated.forcing == 0  # no policy takes its steps for inexact ones
     assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
     assert found.game.max_iterations == 100
+
+
+def test_the_tuned_preset_has_the_papers_game_state_and_networks():
+    paper, tuned = load("paper"), load("paper-tuned")
+    assert tuned.bank == paper.bank
+    assert tuned.step_options == paper.step_options
+    assert tuned.game == dataclasses.replace(paper.game, scale=tuned.game.scale)
+    shape = ("variant", "width", "layers", "actor_layers", "layer_norm", "privileged", "gamma")
+    assert all(getattr(tuned.sac, name) == getattr(paper.sac, name) for name in shape)
+    assert tuned.sac.learn_temperature
 
 
 def test_an_empty_file_is_the_defaults_of_the_classes(tmp_path):

@@ -14,7 +14,7 @@ import pytest
 import toys
 
 from jaxba.game.protocol import Step
-from jaxba.training import sac
+from jaxba.training import sac, train_loop
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig, LoopState, run_chunk, start
 from jaxba.typing import register_pytree
@@ -182,6 +182,37 @@ def test_a_chunk_without_an_end_has_no_means_of_episodes() -> None:
     _, metrics = run_chunk(LEARNS, SHORT, toy, state)
     assert metrics["episodes"] == 0
     assert metrics["episode/length"] == 0
+
+
+@both_agents
+def test_critics_that_know_the_reward_have_no_bias(agent: str) -> None:
+    np.testing.assert_allclose(trained(agent, toys.SEEN)[1]["q_bias"], 0, atol=0.05)
+
+
+def test_the_bias_is_value_less_return_with_entropy_in_terminated_episodes() -> None:
+    rng = np.random.default_rng(0)
+    value, bonus, reward = rng.normal(size=(3, 12, 5))
+    ended = rng.random((12, 5)) < 0.3
+    terminated = ended & (rng.random((12, 5)) < 0.7)
+    errors = []
+    for env in range(5):
+        for k in range(12):
+            ends = np.flatnonzero(ended[k:, env])
+            if len(ends) and terminated[k + ends[0], env]:
+                rest = np.arange(ends[0] + 1)
+                paid = reward[k + rest, env] + np.where(rest > 0, bonus[k + rest, env], 0)
+                errors.append(value[k, env] - np.sum(GAMMA**rest * paid))
+    assert 10 < len(errors) < 50
+    found = train_loop._bias(train_loop._Judged(*map(jnp.asarray, (value, bonus, reward, terminated, ended))), GAMMA)
+    np.testing.assert_allclose(found, np.mean(errors), rtol=1e-12)
+    nothing = jnp.zeros((12, 5), bool)
+    assert jnp.isnan(train_loop._bias(train_loop._Judged(value, bonus, reward, nothing, nothing), GAMMA))
+
+
+def test_the_spread_of_actions_is_that_of_what_is_to_be_done() -> None:
+    assert trained("twin", toys.ACTION)[1]["action_spread"] < 0.05
+    both = trained("twin", toys.BOTH)[1]  # half of the states want 0.5, half -0.5
+    np.testing.assert_allclose(both["action_spread"], 0.5, atol=0.1)
 
 
 def test_the_warm_up_holds_the_demonstrations() -> None:

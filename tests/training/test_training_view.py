@@ -27,6 +27,7 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
     for k in range(3):
         row = {"seed": k, "chunk": chunk, "updates": 8 * chunk, "wall_s": 1.5 * chunk, "episodes": 4.0}
         row |= {"steps_per_s": 1234.0, "updates_per_s": 56.0, "episode/length": 5.0 + k, "episode/ceres": 7.5}
+        row |= {"critic_loss": 0.25, "q_bias": 0.5, "q_mean": -2.0, "entropy": -0.5, "action_spread": 0.1 * k}
         if scores:
             row |= {"held_out/score": scores[k], "held_out/p90": 6.0, "held_out/failures": 0.01}
         found.append(row)
@@ -34,11 +35,26 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
 
 
 def test_a_chunk_has_a_line_and_its_held_out_scores_another():
-    first, second = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True)
+    first, health, second, warning = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True, decades=6.0)
     assert first == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), 2 s of 6"
     assert second.startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
     assert second.endswith(", failures 1.0 % (ceres 6.00, ceres+embedded 5.00), best so far")
-    assert len(view.lines(rows(2), 4, RULES)) == 1
+    spread = "spread of log10(lambda) over states"
+    assert health.endswith(f"critics' loss 0.25, bias +0.5 of -2, entropy -0.50 nats, {spread} 0.00, 0.60, 1.20")
+    assert warning == f"warning: 1 of 3 policies do the same in every state ({spread} 0.00)"
+    assert len(view.lines(rows(2), 4, RULES)) == 2
+
+
+def test_a_policy_that_learned_nothing_is_called_that_once_in_plain_words():
+    row = rows(1, (5.0, 6.0, 7.0))[1]
+    said = lambda **changed: view.lines([row | changed], 4, RULES, decades=6.0)[3:]
+    assert said() == []
+    assert said(q_bias=None) == []
+    (same,) = said(action_spread=0.003)
+    assert same.endswith("this policy does the same in every state (spread of log10(lambda) over states 0.02)")
+    (both,) = said(action_spread=0.003, entropy=0.67)
+    assert both.endswith("; this policy does anything at random (entropy 0.67 of 0.69 nats)")
+    assert said(entropy=0.5) == []
 
 
 COSTS = 8.0 - np.tile([0, 1, 1, 2, 3, 4, 5, 6], (2, 1))
