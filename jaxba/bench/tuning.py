@@ -82,9 +82,6 @@ LAMBDAS, GAINS = (1e-10, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3), (0.0, 0.05, 0.1, 0.5)
 STEPS: tuple[tuple[int, Repairs], ...] = ((2, "all"), (1, "trials"), (2, "trials"), (1, "none"))
 """Point iterations and repairs of the third race, each a program of its own."""
 
-RULES = Candidate("nielsen", 3, "none"), Candidate("ceres", 3, "all")
-"""Other rules with a step that suits them."""
-
 
 class Window(NamedTuple):
     """A part of a problem, and predicted seconds of the work of a step on the whole."""
@@ -248,7 +245,7 @@ def tune(
     winner, count, rows, played, apart = DEFAULT, 0, [], {}, {}
     lambdas = lambda best: [best._replace(policy=f"{GUARDED}:{value:g}") for value in LAMBDAS]
     gains = lambda best: [best._replace(min_gain=value) for value in GAINS]
-    steps = lambda best: [*(best._replace(refine_points=k, repairs=kind) for k, kind in STEPS), *RULES]
+    steps = lambda best: [best._replace(refine_points=k, repairs=kind) for k, kind in STEPS]
     try:
         for stage in (lambdas, gains, steps):
             for count, rows in race([DEFAULT, winner, *stage(winner)], windows[0], within, played, until(RACE_SHARE)):

@@ -14,9 +14,6 @@ from jaxba.cli.options import options
 MOST_SECONDS = 300.0
 """Longest race."""
 
-FILE_WIDTH = 120
-"""Width of the table in characters if the output is not a terminal."""
-
 
 @options
 class Arguments:
@@ -76,7 +73,7 @@ def _tune(args: Arguments, command: str) -> int:
         cells = [(str(one), str(count), "{:.3f} [{:.3f}, {:.3f}]".format(*ratio)) for one, count, ratio in found.rows]
         header = ("settings", "failures", "price over the default's [95%]")
         title = f"Last round of the race, on {found.windows[0]} windows"
-        common.console(FILE_WIDTH).print(to_rich(Table(title, header, cells, "Price: predicted time of the file.")))
+        common.console().print(to_rich(Table(title, header, cells, "Price: predicted time of the file.")))
     line = verdict(found)
     common.print_line(line)
     if not found.in_time:

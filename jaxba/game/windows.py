@@ -27,9 +27,6 @@ HELD_OUT = 0.2
 FEWEST_CAMERAS = 4
 """Cameras of the smallest window."""
 
-MOVED = 0.5
-"""Share of the windows that begin where random scenes do."""
-
 
 def read_windows(
     problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
@@ -117,7 +114,7 @@ def window(
     allowed: Int[np.ndarray, " allowed"],
     rng: np.random.Generator,
     fewest: int = FEWEST_CAMERAS,
-    moved: float = MOVED,
+    moved: float = 0.5,
 ) -> Scenes:
     """One window, its arrays without the axis of scenes.
 
@@ -131,7 +128,7 @@ def window(
         allowed: cameras to choose from.
         rng: source of random numbers.
         fewest: cameras of the smallest window, if there are as many.
-        moved: share of the windows whose start is moved.
+        moved: share of the windows that begin where random scenes do.
     """
     most = min(kind.cameras, len(allowed))
     size = int(rng.integers(min(fewest, most), most + 1))

@@ -1,7 +1,7 @@
 """Derivatives of what a solve finds, by the implicit function theorem.
 
 At a minimum the gradient g of the cost by the unknowns y vanishes, g(y, theta) = 0, where theta are observations,
-measured positions and what is constant. So
+their whitening, measured positions and what is constant. So
 
     dy/dtheta = -H^-1 dg/dtheta,    H = dg/dy,
 
@@ -79,13 +79,16 @@ class SolveInputs(NamedTuple):
     positions: Float[AnyArray, "cameras 3"] | None = None
     """Measured positions, if the problem has priors."""
 
+    whitening: Float[AnyArray, "observations 2 2"] | None = None
+    """`Sigma^(-1/2)` of each observation (1 / pixels); None: that of the problem, without a derivative."""
+
     __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
 
 
 def inputs_of(problem: BundleProblem) -> SolveInputs:
     """The numbers of a problem that `differentiable_solve` takes."""
     positions = None if problem.priors is None else problem.priors.positions
-    return SolveInputs(problem.observations, problem.cameras, problem.points, positions)
+    return SolveInputs(problem.observations, problem.cameras, problem.points, positions, problem.whitening)
 
 
 def differentiable_solve(
@@ -142,6 +145,7 @@ def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
         cameras=host(inputs.cameras),
         points=host(inputs.points),
         observations=host(inputs.observations),
+        whitening=problem.whitening if inputs.whitening is None else host(inputs.whitening),
         priors=priors,
     )
 
@@ -241,8 +245,10 @@ def _solve_transposed(
         return jnp.concatenate([*camera.poses(cameras, unknowns), own]), points
 
     def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
-        pixels = jnp.where(layout.slot_mask, jnp.asarray(theta.observations).T[:, slots], 0)
-        here = replace(layout, pixels=pixels)
+        in_slots = lambda x: jnp.where(layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., slots], 0)
+        here = replace(layout, pixels=in_slots(theta.observations))
+        if theta.whitening is not None:
+            here = replace(here, whitening=in_slots(theta.whitening))
         if theta.positions is not None:
             priors = tuple(replace(one, positions=theta.positions) for one in unknowns.priors)
             here = replace(here, unknowns=replace(unknowns, priors=priors))

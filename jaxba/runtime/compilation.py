@@ -137,14 +137,8 @@ _cache: ExecutableCache | None = None
 
 
 def use_cache(folder: Path | None) -> None:
-    """Makes `ParallelCompilation` read compiled programs from a folder, and store new ones there for later processes.
-
-    For programs of one device. Where JAX's own compilation cache is switched on it is the only one: a program that JAX
-    has read from there cannot be written again.
-
-    Args:
-        folder: must exist and be writable by nobody else; None switches the cache off.
-    """
+    """Makes `ParallelCompilation` keep programs of one device in a folder, which nobody else may write to; None: no
+    longer. JAX's own compilation cache excludes this one: a program that JAX has read cannot be written again."""
     global _cache
     _cache = None if folder is None else ExecutableCache(folder)
 

@@ -17,7 +17,6 @@ import importlib
 import json
 import os
 import threading
-import time
 import types
 import zlib
 from collections.abc import Callable, Iterator
@@ -31,15 +30,12 @@ from jax import monitoring
 from jaxlib import xla_client
 
 from jaxba.runtime import process
-from jaxba.runtime.atomic import TEMPORARY, atomic_write
+from jaxba.runtime.atomic import atomic_write
 
 SUFFIX = ".jaxba-program"
 
 LIMIT = 1 << 30
 """Bytes that a folder's programs may have; the least recently used are removed first."""
-
-ABANDONED_S = 3600.0
-"""Age of a temporary file whose writer must have been killed."""
 
 IN_MEMORY = 16
 """Programs read from disk that a process keeps: a solve has six."""
@@ -133,10 +129,7 @@ class ExecutableCache:
             stored.path.unlink()
 
     def _evict(self) -> None:
-        """Removes the least recently used programs, down to `LIMIT`, and what was never finished."""
-        for part in self.folder.glob(TEMPORARY.format("*")):
-            if part.stat().st_mtime < time.time() - ABANDONED_S:
-                part.unlink(missing_ok=True)
+        """Removes the least recently used programs, down to `LIMIT`."""
         found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
         total = 0
         for status, file in found:

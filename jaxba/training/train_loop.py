@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxba.game.devices import AXIS
 from jaxba.game.protocol import Environment, Step
@@ -183,13 +183,13 @@ def run_chunk(
 
 
 class _Judged(NamedTuple):
-    """What the critics said of the actions of a chunk, and what came of them."""
+    """What the critics said of the actions of a chunk, and what came of them: (steps, envs) each."""
 
-    value: Float[Array, "steps envs"]
-    bonus: Float[Array, "steps envs"]  # for the entropy of the action
-    reward: Float[Array, "steps envs"]
-    terminated: Bool[Array, "steps envs"]
-    ended: Bool[Array, "steps envs"]
+    value: Array
+    bonus: Array  # for the entropy of the action
+    reward: Array
+    terminated: Array
+    ended: Array
 
 
 def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:

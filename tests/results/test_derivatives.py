@@ -38,8 +38,9 @@ def constrained() -> jaxba.BundleProblem:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
-def test_derivatives_by_observations_priors_and_constants_are_those_of_differences(linear_solver):
+def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_differences(linear_solver):
     problem, rng = constrained(), np.random.default_rng(1)
+    problem = problem.replace(whitening=np.tile(np.array([[1.0, 0.3], [0.3, 0.8]]), (problem.num_observations, 1, 1)))
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
     weights = rng.normal(size=problem.cameras.shape) * [1, 1, 1, 1, 1, 1, 1e-3, 1, 1], rng.normal(size=(40, 3))
 
@@ -52,6 +53,7 @@ def test_derivatives_by_observations_priors_and_constants_are_those_of_differenc
     steps = {
         "observations": inputs.observations.at[7, 1].add(1.0) - inputs.observations,
         "positions": inputs.positions.at[2, 1].add(1.0) - inputs.positions,
+        "whitening": jnp.zeros_like(inputs.whitening).at[:30, 0].set(1.0),
         "cameras": jnp.zeros_like(inputs.cameras).at[0, 4].set(1.0).at[:, 8].set(0.3),  # k2 is one number of all
         "points": jnp.zeros_like(inputs.points).at[3, 0].set(1.0),
     }
