@@ -215,7 +215,6 @@ def _collect(game: Game, number: int, policy: AgentPolicy, actions: Array, key: 
             pick = jnp.where(jax.random.bernoulli(explores, EXPLORED), drawn, 0)
             after = _advance(game, kind, bank, run, tried[pick])
             after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, run)
-            # from here on: an iteration that is over is the same for all
             left = taken - run.iterations
             return after, (alive, observe(policy.config, run.episode.memory), left)
 

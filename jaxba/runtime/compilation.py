@@ -250,9 +250,7 @@ class ParallelCompilation:
 
 def compile_and_run(function: Program, *arguments: Any) -> Any:
     """What a program computes, for one that runs once; it is read from the cache of `use_cache` if it is there."""
-    with ParallelCompilation() as compile_programs:
-        compile_programs(function, *arguments)
-    return compile_programs.run(function, *arguments)
+    return function(*arguments) if _cache is None else ParallelCompilation().run(function, *arguments)
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:
