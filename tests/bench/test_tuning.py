@@ -52,7 +52,9 @@ def test_the_default_stays_to_the_end_of_a_race_and_what_is_far_worse_leaves_aft
 
 def test_where_nothing_is_better_the_default_is_kept():
     """In races of equals, which somebody wins by luck, it is replaced about as seldom as its interval says."""
-    assert tune(WINDOWS, np.inf, play=Family(policy=1.5, refine_points=1.5, repairs=1.5, min_gain=1.5)).chosen == DEFAULT
+    assert (
+        tune(WINDOWS, np.inf, play=Family(policy=1.5, refine_points=1.5, repairs=1.5, min_gain=1.5)).chosen == DEFAULT
+    )
     replaced = [tune(WINDOWS, np.inf, play=Family(seed)).chosen != DEFAULT for seed in range(8)]
     assert sum(replaced) <= 1
 
