@@ -1,6 +1,6 @@
 """Time to compile the parts of a step and time to run them, at each level of optimisation.
 
-    python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
+    python -m benchmarks.compilation PROBLEM ... [--solver guarded] [--linear-solver auto] [--repeats 15]
     python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The last column shows after
@@ -141,7 +141,7 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("problem", nargs="+")
-    parser.add_argument("--solver", default="learned")
+    parser.add_argument("--solver", default="guarded")
     parser.add_argument("--linear-solver", default="auto")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--whole", action="store_true", help="time calls of jaxba-solve")

@@ -71,7 +71,7 @@ class Trainings:
     def begin(self, run: Path) -> subprocess.Popen[str]:
         """Starts a training, or resumes what is in its folder."""
         arguments = ["--out", str(run)]
-        arguments += ["--resume"] if (run / CONFIG).is_file() else ["--config", "fast", "--set", *SETTINGS]
+        arguments += ["--resume"] if (run / CONFIG).is_file() else ["--config", "default", "--set", *SETTINGS]
         command = [sys.executable, "-c", COMMAND, *arguments]
         pipe, both = subprocess.PIPE, subprocess.STDOUT
         return subprocess.Popen(

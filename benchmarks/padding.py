@@ -1,6 +1,6 @@
 """Solves of sliding windows over a sequence, without and with padding of their sizes.
 
-    python -m benchmarks.padding [PROBLEM] [--windows 20] [--cameras 20] [--policy learned] [--repeats 5]
+    python -m benchmarks.padding [PROBLEM] [--windows 20] [--cameras 20] [--policy bold] [--repeats 5]
 
 PROBLEM is a file; by default the windows are parts of a random sequence. All windows are solved once without and once
 with padding, each time starting without compiled programs. The time of an iteration is then measured without
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("problem", nargs="?")
     parser.add_argument("--windows", type=int, default=20)
     parser.add_argument("--cameras", type=int, default=20)
-    parser.add_argument("--policy", default="learned")
+    parser.add_argument("--policy", default="bold")
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     process.keep_memory()

@@ -50,14 +50,12 @@ TOLERANCE_SOLVERS = (
     "ceres+refine3",
     "nielsen+refine3",
     "ceres+embedded",
-    "learned",
     "bold",
     "ceres+refine3@float32",
     "nielsen+refine3@float32",
-    "learned@float32",
+    "bold@float32",
 )
-"""Rules with embedded iterations, the shipped policy, and `bold`, its twin without a network; some also in float32,
-which is accurate enough for 1e-3."""
+"""Rules with embedded iterations, and `bold`; some also in float32, which is accurate enough for 1e-3."""
 
 ROUNDING = 2e-5
 """Relative error of a cost in float32, by which a solve may end above its target: a fiftieth of the tolerance."""

@@ -1,6 +1,6 @@
 """A training divided over virtual devices: the same curve, and the work of each device.
 
-    python -m benchmarks.training_devices [--devices 1,2,4] [--config fast] [--steps 32]
+    python -m benchmarks.training_devices [--devices 1,2,4] [--config paper-tuned] [--steps 32]
 
 Devices on one CPU share its cores: what they show is the CPU time of each, XLA's count of operations of each, and that
 the numbers stay. Each number of devices is a process of its own. Scenes are random and unsolved: only work counts.
@@ -67,7 +67,7 @@ def main() -> None:
     """Prints a row for each number of devices."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", default="1,2,4")
-    parser.add_argument("--config", default="fast")
+    parser.add_argument("--config", default="paper-tuned")
     parser.add_argument("--steps", type=int, default=32)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()

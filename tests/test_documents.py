@@ -75,8 +75,8 @@ def workplace(tmp_path, monkeypatch) -> Path:
     """A folder with small files under the names that the documents use."""
     scene = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=30), seed=0)
     jaxba.write_problem(scene, tmp_path / "problem-49-7776-pre.txt.bz2")
-    (tmp_path / "runs/fast").mkdir(parents=True)
-    shutil.copy(ROOT / "jaxba/policies/default.safetensors", tmp_path / "runs/fast/policy.safetensors")
+    (tmp_path / "runs/mine").mkdir(parents=True)
+    shutil.copy(ROOT / "jaxba/policies/default.safetensors", tmp_path / "runs/mine/policy.safetensors")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
     return tmp_path

@@ -32,7 +32,7 @@ RULES = GameConfig(agent=AGENT, max_iterations=4)
 def tiny_bank() -> Bank:
     """A dozen scenes or more, with the best costs that Ceres' and GTSAM's rules find."""
     key = jax.random.key(5)
-    return select(*solve_scenes(KIND, key, make_scenes(KIND, key, 120), StepOptions(), 40, rules=("ceres",)))
+    return select(*solve_scenes(KIND, make_scenes(KIND, key, 120), StepOptions(), 40, rules=("ceres",)))
 
 
 def tiny_game(config: GameConfig = RULES, envs: int = 6) -> Game:

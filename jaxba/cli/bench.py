@@ -17,8 +17,8 @@ from jaxba.cli import common
 from jaxba.cli.options import options
 from jaxba.problem.options import LinearSolverChoice
 
-DEFAULT_SOLVERS = "guarded,learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
-"""The default policy, the other two that ship, the paper's rule, and Ceres' rule with and without embedded
+DEFAULT_SOLVERS = "guarded,bold,classic,ceres,ceres+refine3,ceres+embedded"
+"""The default policy and the guard of agents, the paper's rule, and Ceres' rule with and without embedded
 iterations."""
 
 FILE_WIDTH = 180

@@ -108,18 +108,19 @@ class Step:
     """How a step is computed."""
 
     policy: Annotated[str, "NAME"] = DEFAULT_POLICY
-    """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), learned (the shipped network), bold (the
-    smallest lambda that its guard allows), a .safetensors file of jaxba-train, or a rule: ceres, classic, gtsam,
-    nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most rules take the first lambda, as in
-    classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is --refine-points K."""
+    """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), bold (the smallest lambda that the guard
+    of agents allows), learned (the shipped network, without embedded iterations), a .safetensors file of jaxba-train,
+    or a rule: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most
+    rules take the first lambda, as in classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is
+    --refine-points K."""
 
     method: Annotated[str, "NAME"] = DEFAULT_METHOD
     """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. ddlm, ddlm:16: clusters in
     parallel. deeplm: conjugate gradients on all variables. poba: a power series."""
 
     refine_points: int | None = None
-    """Point iterations after each camera step. Default: the embedded iterations of a learned policy; none for a
-    rule."""
+    """Point iterations after each camera step. Default: those that the policy brings (guarded, bold, learned); none
+    for a rule."""
 
     repairs: Repairs | None = None
     """Of a bad step. none; trials: up to three shorter steps; all: camera rounds and pattern moves, too. Default: those

@@ -38,8 +38,7 @@ class Run:
     """What is trained, and where."""
 
     config: Annotated[str | None, "NAME"] = None
-    """Preset (default, plain, driver, fast, paper, paper-tuned; bal and kitti with --problems) or YAML file. A resumed
-    run has its configuration in its folder."""
+    """Preset (default, paper, paper-tuned) or YAML file. A resumed run has its configuration in its folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...],

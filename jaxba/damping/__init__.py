@@ -6,7 +6,7 @@ from jaxba.damping.policy_file import load_policy, save_policy
 from jaxba.damping.registry import (
     LEARNED,
     POLICIES,
-    brings_embedded,
+    brings_step,
     is_learned,
     make_policy,
 )
@@ -24,7 +24,7 @@ __all__ = [
     "LearnedPolicy",
     "ProblemInfo",
     "Schedule",
-    "brings_embedded",
+    "brings_step",
     "is_learned",
     "load_policy",
     "make_policy",

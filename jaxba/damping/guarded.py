@@ -42,7 +42,7 @@ def times_shortened(step: StepInfo) -> Float[Array, ""]:
 def smallest_decades(low: float, dtype: Any) -> float:
     """log10 of the smallest lambda: `low`, but not below the rounding unit, which is lost in a sum with a diagonal.
 
-    In float64 that is below every policy's range. In float32 `learned` would go to 1e-9, at which the systems of real
+    In float64 that is below every policy's range. In float32 `bold` would go to 1e-9, at which the systems of real
     problems have no correct digit left, and steps are rejected or shortened to a quarter.
     """
     return max(low, math.log10(float(jnp.finfo(dtype).eps)))

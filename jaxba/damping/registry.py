@@ -7,41 +7,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.guarded import Guarded
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest
+from jaxba.damping.learned import ConstantAction, boldest
 from jaxba.damping.policy import DampingPolicy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 from jaxba.typing import InputError
 
-LEARNED, BOLD = "learned", "bold"
-"""Shipped networks, and the guard and step of the same without a network."""
+LEARNED, BOLD, GUARDED = "learned", "bold", "guarded"
+"""The shipped network, for lambda alone; the guard of agents without a network; the default policy of a solve."""
 
-PLAIN, DRIVER = "-plain", "-driver"
-"""Endings of their variants: for lambda alone (`learned+refine0`), and for lambda alone if another library makes the
-step and damps cameras and points alike. In the name of a solver, `learned` and `bold` mean the one that fits the step
-(solver/names.py)."""
-
-SHIPPED = {
-    LEARNED: "default.safetensors",
-    LEARNED + PLAIN: "plain.safetensors",
-    LEARNED + DRIVER: "driver.safetensors",
-}
-"""Their files in `jaxba/policies`, each trained with the preset of `jaxba-train` that has the file's name."""
-
-GUARDED = "guarded"
-"""The default policy of a solve."""
-
-_GUARD_OF = {BOLD + name.removeprefix(LEARNED): name for name in SHIPPED}
+SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
+"""File of `learned`, trained with the preset of `jaxba-train` that has its name."""
 
 
-def bold(guard_of: str = LEARNED) -> ConstantAction:
-    """The smallest lambda that the guard of a shipped policy allows, in every iteration.
-
-    Args:
-        guard_of: the shipped policy; its file says how it is guarded.
-    """
-    return boldest(_shipped(guard_of).config)
+def bold() -> ConstantAction:
+    """The smallest lambda that the guard of agents allows, in every iteration, and all embedded iterations."""
+    return boldest(AgentConfig())
 
 
 POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
@@ -54,7 +37,7 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "schedule": (Schedule, "the paper's cycle 1e-15, 1e-15, 0.194, 0.551"),
     "gauss-newton": (gauss_newton, "next to no damping: 1e-10 throughout"),
     GUARDED: (Guarded, "1e-8, raised by half a decade after a failure; Ceres' rule after two in a row"),
-    BOLD: (bold, "the smallest lambda that the guard of `learned` allows: 1e-5, then /32 down to 1e-9"),
+    BOLD: (bold, "the smallest lambda that the guard of agents allows: 1e-5, then /32 down to 1e-9"),
 }
 """Factory and one line of description by name."""
 
@@ -69,19 +52,14 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: `learned` (the one for steps with embedded iterations) or another key of `SHIPPED`; the path of a policy
-            file; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; `bold-plain`, `bold-driver`; or
-            `constant:LAMBDA`.
+        name: `learned`; the path of a policy file; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one;
+            or `constant:LAMBDA`.
 
     Raises:
         InputError: no such policy, a lambda that is not a positive number, or a path that is not of a policy file.
     """
-    if name in SHIPPED:
-        return _shipped(name)
     if is_learned(name):
-        return load_policy(name)
-    if name in _GUARD_OF:
-        return bold(_GUARD_OF[name])
+        return load_policy(SHIPPED if name == LEARNED else name)
     base, colon, number = name.partition(":")
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
@@ -102,16 +80,12 @@ def make_policy(name: str) -> DampingPolicy:
 
 def is_learned(name: str) -> bool:
     """Whether a policy of this name has a network."""
-    return name in SHIPPED or name.endswith(SUFFIX)
+    return name == LEARNED or name.endswith(SUFFIX)
 
 
-def brings_embedded(name: str) -> bool:
-    """Whether a policy of this name has a configuration with embedded iterations of its own."""
-    return is_learned(name) or name in _GUARD_OF or name.partition(":")[0] == GUARDED
-
-
-def _shipped(name: str) -> LearnedPolicy:
-    return load_policy(Path(__file__).parent.parent / "policies" / SHIPPED[name])
+def brings_step(name: str) -> bool:
+    """Whether a policy of this name brings a step of its own, with embedded iterations or without."""
+    return is_learned(name) or name.partition(":")[0] in (BOLD, GUARDED)
 
 
 def _damping(name: str, number: str) -> float:

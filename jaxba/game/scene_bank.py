@@ -22,7 +22,6 @@ from jaxba.damping import ProblemInfo, make_policy
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.rollout import play
 from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
-from jaxba.game.warm_starts import warm_starts
 from jaxba.game.windows import read_windows
 from jaxba.io.files import StrPath
 from jaxba.model.linearize import cost
@@ -132,9 +131,6 @@ class BankConfig:
     refine_points: int = 3
     """Embedded point iterations of the portfolio."""
 
-    warm_share: float = 0.0
-    """Fraction of the scenes that begin after a few heavily damped iterations (`warm_starts.py`)."""
-
     problems: tuple[str, ...] = ()
     """Real problems, from which classes of the family `windows` are cut."""
 
@@ -155,8 +151,6 @@ class BankConfig:
         check_count("refine_points", self.refine_points, 0)
         if min(self.scenes) < 1:
             raise ValueError("every class needs at least one scene")
-        if not 0 <= self.warm_share <= 1:
-            raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
         if bool(self.problems) != any(kind.family == "windows" for kind in self.classes):
             raise ValueError("problems and classes of the family windows go together: only one of them is given")
         _ = self.options  # raises ValueError if impossible
@@ -165,36 +159,28 @@ class BankConfig:
 @for_traces
 def solve_scenes(
     kind: SceneClass,
-    key: Array,
     scenes: Scenes,
     options: StepOptions,
     limit: int,
     rules: Sequence[str] = PORTFOLIO,
     on_rule: Callable[[str], None] = lambda _: None,
-    warm_share: float = 0.0,
     tolerance: float = 1e-3,
 ) -> tuple[Bank, Bool[np.ndarray, " scenes"]]:
     """Solves scenes with every rule, and tells which of them are usable.
 
     Args:
         kind: class of the scenes.
-        key: random key, for warm starts.
         scenes: the scenes.
         options: of the steps.
         limit: iterations of an episode, for the scenes' `ProblemInfo`.
         rules: the portfolio.
         on_rule: called with the name of a rule when it begins.
-        warm_share: fraction of the scenes with a warm start.
         tolerance: to which the first rule's iterations are counted.
     """
-    count = len(scenes.mask)
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
     keep = worth_solving(kind, info)
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
-    if warm_share:
-        scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)
-        info = info_of(kind, scenes, initial, limit)
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
     for rule in rules:
@@ -246,8 +232,8 @@ def make_banks(
         where = f"{kind.cameras} cameras x {kind.points} points"
         on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
         class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
-        solved = lambda scenes, on_rule=on_rule, kind=kind, class_key=class_key: solve_scenes(
-            kind, class_key, scenes, options, limit, PORTFOLIO, on_rule, config.warm_share, tolerance
+        solved = lambda scenes, on_rule=on_rule, kind=kind: solve_scenes(
+            kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance
         )
         if kind.family == "windows":
             seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))

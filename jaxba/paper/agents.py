@@ -1,4 +1,5 @@
-"""The trained agents that the tables compare: one configuration with one change in each, all on the same scenes.
+"""The trained agents that the tables compare: the paper's as printed and as tuned, the best one for lambda alone, and
+those of the ablations, which change one setting of the tuned one; all on the same scenes.
 
 Each agent is trained in its own folder inside the folder of the run. An interrupted training continues there.
 """
@@ -13,19 +14,21 @@ from pathlib import Path
 import numpy as np
 
 from jaxba.bench.sources import Source
-from jaxba.damping import LearnedPolicy, load_policy, save_policy
+from jaxba.damping import ConstantAction, save_policy
 from jaxba.game.env import Game, make_game
+from jaxba.game.evaluate import best_constant_action
 from jaxba.game.scene_bank import Bank, Split, select
 from jaxba.paper import real_problems
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.settings import to_yaml
 from jaxba.training import config as train_configs
-from jaxba.training import driver, task
+from jaxba.training import driver, log, task, view
 from jaxba.training.config import TrainConfig
+from jaxba.training.task import Task
 
-POLICY = "policy.safetensors"
-"""File of a trained policy."""
+POLICY = "policy-{}.safetensors"
+"""File of the trained policy of an agent's training run, by its number from 1."""
 
 SCENES = "scenes"
 """Folder of the synthetic scenes, which all agents but those for real problems share."""
@@ -41,8 +44,11 @@ class Agent:
     name: str
     """Name in records and folders."""
 
+    preset: str = "paper-tuned"
+    """Of `jaxba-train`."""
+
     overrides: tuple[str, ...] = ()
-    """Settings (`key=value`) that differ from the paper's agent."""
+    """Settings (`key=value`) that differ from the preset."""
 
     few_scenes: bool = False
     """Whether it is trained on as few scenes as the paper's agent."""
@@ -52,88 +58,130 @@ class Agent:
 
 
 OURS = Agent("agent")
-"""The paper's agent, as the configuration interprets the paper."""
+"""The paper's agent with what it takes to learn; the ablations change one of its settings each."""
+
+PRINTED = Agent("agent-printed", "paper")
+"""The paper's agent with the settings that it prints."""
+
+BEST = Agent("agent-guarded", "default")
+"""The best agent for lambda alone: scale-free observations, and the guard."""
 
 SECONDS = 5.5
 """Mean duration of an iteration by the clock, against a bonus of 10. Source: the paper's table on BAL, 110 s of 20
 iterations of classic."""
 
-BY_THE_CLOCK = ("game.reward=clock", f"game.scale={SECONDS}", f"game.bonus={10 / SECONDS}")
-"""Reward of minus the duration in seconds, and a bonus of 10: the scale is a factor on both."""
+BY_THE_CLOCK = ("game.reward=clock", f"game.scale={0.1 * SECONDS}", f"game.bonus={10 / SECONDS}")
+"""Reward of minus the duration in seconds, and a bonus of 10, times the tenth of the preset: the scale is a factor on
+both."""
 
-FEW = Agent("agent-ten", few_scenes=True)
-REDUCTION = Agent("agent-reduction", ("game.reward=reduction",))
-CLOCK = Agent("agent-clock", BY_THE_CLOCK)
-REVERSED = Agent("agent-reversed", ("game.reward=reversed", "game.agent.observation=duration"))
+FEW = replace(OURS, name="agent-ten", few_scenes=True)
+REDUCTION = replace(OURS, name="agent-reduction", overrides=("game.reward=reduction",))
+CLOCK = replace(OURS, name="agent-clock", overrides=BY_THE_CLOCK)
+REVERSED = replace(OURS, name="agent-reversed", overrides=("game.reward=reversed", "game.agent.observation=duration"))
 
-WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[400]")
+WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[400]", "bank.refine_points=3")
 """Windows of an agent that is trained on real problems. Ten points, as in the synthetic scenes, would leave most
 cameras of a window with too few observations."""
 
 
-def trained_elsewhere(config: PaperConfig, source: Source) -> Agent | None:
-    """The agent for a real problem, trained on other ones (`real_problems.training_files`); None if there are none."""
+def trained_elsewhere(config: PaperConfig, source: Source, kind: Agent, method: str = "lm") -> Agent | None:
+    """The agent for a real problem, trained on other ones (`real_problems.training_files`) with the steps of a method;
+    None if there are none."""
     left_out, files = real_problems.training_files(config.real, source)
     if not files:
         return None
-    return Agent(f"agent-without-{left_out}", (*WINDOWS, *BY_THE_CLOCK), problems=files)
+    lens = "fixed" if source.family == config.real.kitti.name else "free"
+    overrides = (*kind.overrides, *WINDOWS, f"bank.intrinsics={lens}", f"method={method}")
+    name = f"{kind.name}-{method}-without-{left_out}"
+    return replace(kind, name=name, overrides=overrides, problems=files)
 
 
 def with_state_size(size: int) -> Agent:
     """The agent that observes the last `size` errors."""
-    return OURS if size == PAPER_STATE else Agent(f"agent-state-{size}", (f"game.agent.history={size}",))
+    return (
+        OURS
+        if size == PAPER_STATE
+        else replace(OURS, name=f"agent-state-{size}", overrides=(f"game.agent.history={size}",))
+    )
 
 
-def train_config(config: PaperConfig, agent: Agent, seed: int) -> TrainConfig:
-    """Configuration of one training run, which trains one agent, so that no choice is made among several.
+def train_config(config: PaperConfig, agent: Agent) -> TrainConfig:
+    """Configuration of the training of an agent: all training runs side by side, on the scenes of the paper's game.
 
     Raises:
         SettingsError: an override is invalid.
     """
-    found = train_configs.load(config.agents.preset, (*config.agents.overrides, *agent.overrides, "seeds=1"))
-    found = train_configs.with_problems(found, agent.problems) if agent.problems else found
-    return replace(found, seed=config.seed + seed)  # seed of the agent; the scenes are shared
+    changes = (*config.agents.overrides, *agent.overrides, f"seeds={config.agents.seeds}", f"seed={config.seed}")
+    found = train_configs.load(agent.preset, changes)
+    bank = train_configs.load(OURS.preset, changes).bank
+    found = replace(found, bank=bank, chunks=max(1, round(config.agents.length * found.chunks)))
+    return train_configs.with_problems(found, agent.problems) if agent.problems else found
 
 
-def updates(config: PaperConfig) -> int:
+def updates(config: PaperConfig, agent: Agent) -> int:
     """Updates of the networks in a training run."""
-    found = train_config(config, OURS, 0)
+    found = train_config(config, agent)
     return found.chunks * found.loop.steps_per_chunk * found.loop.updates_per_step
 
 
-def trained(
-    config: PaperConfig, agent: Agent, seed: int, folder: Path, report: Callable[[str], None]
-) -> tuple[LearnedPolicy, bool]:
-    """The policy of an agent. Trains it if the folder does not have it yet.
+def own_folder(agent: Agent, folder: Path) -> Path:
+    """The folder of an agent in that of the reproduction run."""
+    return folder / "agents" / agent.name
+
+
+def train(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> bool:
+    """Trains an agent if the folder does not have its policies yet.
 
     Args:
         config: configuration of the reproduction run.
         agent: the agent.
-        seed: number of the training run, from 0.
         folder: folder of the reproduction run.
         report: called with a line of text when something starts.
 
     Returns:
-        The policy, and whether it was trained by this call.
+        Whether it was trained by this call.
 
     Raises:
         InputError: the training cannot start or continue; the message is one line.
     """
-    own = folder / "agents" / f"{agent.name}-{seed}"
-    if (own / POLICY).is_file():
-        return load_policy(own / POLICY), False
-    wanted = train_config(config, agent, seed)
+    own = own_folder(agent, folder)
+    files = [own / POLICY.format(seed + 1) for seed in range(config.agents.seeds)]
+    if all(file.is_file() for file in files):
+        return False
     begun = (own / driver.CONFIG).is_file()
-    settings = driver.prepare_folder(own, wanted, resume=begun)
+    settings = driver.prepare_folder(own, train_config(config, agent), resume=begun)
+    work, played = game_of(config, agent, folder, report)
+    note = lambda rows: report(f"{agent.name}: {rows[0]['chunk']} of {settings.chunks} parts")
+    outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
+    for file, best in zip(files, outcome.best, strict=True):  # every run's own, so that no choice is made among them
+        save_policy(file, work.policy(best.actor), {"config": to_yaml(settings)})
+    shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)
+    return True
+
+
+def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> ConstantAction:
+    """The agent's twin without learning: the constant action with the fewest iterations on its training scenes, under
+    the same guard and step."""
+    report(f"{agent.name}: best constant action")
+    work, played = game_of(config, agent, folder, report)
+    banks, rules = task.first_scenes(played.banks, work.held_out), played.config
+    limits = rules.tolerance, rules.max_iterations
+    return best_constant_action(played.kinds, banks, rules.agent, played.options, *limits)
+
+
+def collapsed(config: PaperConfig, agent: Agent, folder: Path) -> list[bool]:
+    """Of every training run, whether its policy did the same in every state in the end; none before it is trained."""
+    rows, wired = log.read(own_folder(agent, folder)), train_config(config, agent).game.agent
+    decades = (wired.high - wired.low) / 2
+    return [decades * row["action_spread"] < view.SAME for row in rows if row["chunk"] == rows[-1]["chunk"]]
+
+
+def game_of(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> tuple[Task, Game]:
+    """The task of an agent, and the game in which it is trained, without the scenes of the tables."""
+    settings = train_config(config, agent)
     _shared_scenes(config, agent, folder, report)
     work = task.build(settings, _scenes_folder(agent, folder))
-    played = work.game if agent.problems else game(config, agent, settings, scenes(config, folder, report)[0])
-    note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
-    outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
-    (best,) = outcome.best  # of one agent
-    save_policy(own / POLICY, work.policy(best.actor), {"config": to_yaml(settings)})
-    shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)
-    return load_policy(own / POLICY), True
+    return work, work.game if agent.problems else game(config, agent, settings, scenes(config, folder, report)[0])
 
 
 def scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> tuple[Bank, Bank]:
@@ -161,13 +209,13 @@ def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Ban
 
 
 def _shared_scenes(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> Split:
-    """The scenes of an agent's training runs. Generates them if the folder does not have them yet."""
+    """The scenes of an agent's training. Generates them if the folder does not have them yet."""
     shared = _scenes_folder(agent, folder)
     if not all((shared / name).is_file() for name in (task.BANK, task.RULES)):
         shared.mkdir(parents=True, exist_ok=True)
-        task.build(train_config(config, agent if agent.problems else OURS, 0), shared, report, BASELINES)
+        task.build(train_config(config, agent if agent.problems else OURS), shared, report, BASELINES)
     return task.read_banks(shared / task.BANK)[0]
 
 
 def _scenes_folder(agent: Agent, folder: Path) -> Path:
-    return folder / (f"{SCENES}-{agent.name}" if agent.problems else SCENES)
+    return folder / (f"{SCENES}-{agent.name.rpartition('-without-')[2]}" if agent.problems else SCENES)

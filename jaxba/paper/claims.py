@@ -16,10 +16,10 @@ from jaxba.paper.results import Row
 Status = Literal["reproduced", "partly", "not", "not run"]
 
 RATIO_TOLERANCE = 1.25
-"""A ratio is reproduced if ours is at most this times the paper's."""
+"""A ratio is reproduced if ours is the paper's up to this factor, either way."""
 
 PARTLY_RATIO = 0.9
-"""A ratio is partly reproduced if ours is at most this, a gain of at least a tenth."""
+"""A ratio is partly reproduced if ours is at most this, a gain of at least a tenth, of another size."""
 
 FRACTION_TOLERANCE = 0.05
 """A fraction is reproduced if ours differs from the paper's by at most this. Also the largest deficit in success of a
@@ -29,14 +29,16 @@ PARTLY_FRACTION_TOLERANCE = 0.15
 """A fraction is partly reproduced if ours differs from the paper's by at most this."""
 
 CRITERION = (
-    f"A **ratio** is *reproduced* if ours is at most {RATIO_TOLERANCE:g} times the paper's, *partly* if it is at most "
-    f"{PARTLY_RATIO:g} (a gain of a tenth), else *not*. An **order** (A takes fewer iterations than B) is *reproduced* "
+    f"A **ratio** is *reproduced* if ours is the paper's up to a factor of {RATIO_TOLERANCE:g}, larger or smaller, "
+    f"*partly* if it is at most {PARTLY_RATIO:g} (a gain of another size), else *not*. "
+    "An **order** (A takes fewer iterations than B) is *reproduced* "
     f"if A takes at most {PARTLY_RATIO:g} of B's iterations and their ranges over the training runs do not overlap, "
     "*partly* if only A's mean is lower, else *not*. "
     f"A **fraction** is *reproduced* within {100 * FRACTION_TOLERANCE:.0f} percentage points, *partly* within "
     f"{100 * PARTLY_FRACTION_TOLERANCE:.0f}. A claim about iterations or seconds is *not* reproduced, whatever the "
     "numbers, if the fraction of problems on which the method succeeds is lower than that of the other method by more "
-    "than five percentage points, and *not run* if it was not run on all of them. An **error** is *reproduced* if ours "
+    "than five percentage points, and *not run* if it was not run on all of them, or if most training runs of a method "
+    "*collapsed*: their policies do the same in every state. An **error** is *reproduced* if ours "
     "is larger by less than the paper's difference on every problem, *partly* if on half of them, else *not*. "
     "The column `to f*(1+1e-3)` compares the iterations until the cost is within 1e-3 of the best known one; verdicts "
     "are by the stop rule, as the paper's numbers."
@@ -92,11 +94,12 @@ def is_less_successful(one: Row, other: Row) -> bool:
 
 
 def _comparable(name: str, one: Row | None, other: Row | None) -> bool:
-    """Whether two means are positive numbers, over the same number of problems."""
+    """Whether two means are positive numbers, over the same number of problems, and of no collapsed agents."""
     if one is None or other is None:
         return False
     means = getattr(one, name), getattr(other, name)
-    return all(math.isfinite(mean) and mean > 0 for mean in means) and one.solves == other.solves
+    learned = not (one.collapsed or other.collapsed)
+    return learned and all(math.isfinite(mean) and mean > 0 for mean in means) and one.solves == other.solves
 
 
 def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None, of: str = "iterations") -> Claim:
@@ -105,7 +108,8 @@ def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None, of:
         return Claim(text, f"{paper:.2f}", "-", "not run")
     one, other = getattr(ours, of), getattr(base, of)
     found = one / other
-    status: Status = "reproduced" if found <= RATIO_TOLERANCE * paper else "partly" if found <= PARTLY_RATIO else "not"
+    near_enough = paper / RATIO_TOLERANCE <= found <= RATIO_TOLERANCE * paper
+    status: Status = "reproduced" if near_enough else "partly" if found <= PARTLY_RATIO else "not"
     parts = f"{one:.1f} / {other:.1f}" if of == "iterations" else f"{number(one)} / {number(other)} s"
     detail = f"{found:.2f} ({parts})"
     if is_less_successful(ours, base):
@@ -145,7 +149,7 @@ def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) ->
 
 def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
     """The claim that a method succeeds on the fraction `paper` of the problems."""
-    if ours is None or math.isnan(ours.success):
+    if ours is None or math.isnan(ours.success) or ours.collapsed:
         return Claim(text, f"{100 * paper:.0f} %", "-", "not run")
     gap = abs(paper - ours.success)
     status: Status = (

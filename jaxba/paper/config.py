@@ -19,11 +19,11 @@ CONFIG = "config.yaml"
 class AgentsConfig:
     """The agents that are trained for the ablation tables."""
 
-    preset: str = "paper"
-    """Of `jaxba-train`; what the tables vary is put on top."""
+    length: float = 1.0
+    """Of every training, relative to that of its preset of `jaxba-train`."""
 
     overrides: tuple[str, ...] = ()
-    """Changes of the preset for all agents as `key=value`, such as the length of the training."""
+    """Changes of the presets of all agents as `key=value`."""
 
     seeds: int = 3
     """Training runs of each kind of agent. All of them enter the tables."""
@@ -100,14 +100,6 @@ class FigureConfig:
     large_scene: str = "scene:ladybug-1197"
     """Scene of the large convergence plot, instead of the problem Ladybug-1197."""
 
-    large_solvers: tuple[str, ...] = (
-        "classic/implicit",
-        "ceres/implicit",
-        "learned/implicit",
-        "learned-driver/implicit",
-    )
-    """Solvers on the large scene, as `SOLVER/LINEAR_SOLVER`."""
-
     large_iterations: int = 100
     """Limit of linear solves on the large scene."""
 
@@ -147,6 +139,8 @@ class PaperConfig:
         counts |= {"zero_net.updates": self.zero_net.updates, "zero_net.layers": self.zero_net.layers}
         counts |= {"real.repeats": self.real.repeats, "small_scenes": self.small_scenes}
         counts |= {"figures.large_iterations": self.figures.large_iterations}
+        if not self.agents.length > 0:
+            raise ValueError(f"agents.length must be positive, not {self.agents.length}")
         for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, not {value}")

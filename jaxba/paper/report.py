@@ -8,7 +8,7 @@ from jaxba.bench import profile
 from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
 from jaxba.bench.page import Page
 from jaxba.bench.run import machine
-from jaxba.paper.agents import updates
+from jaxba.paper.agents import BEST, OURS, PRINTED, updates
 from jaxba.paper.claims import CRITERION, Claim
 from jaxba.paper.runner import Runner
 from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
@@ -65,6 +65,7 @@ def write(runner: Runner, path: Path, command: str) -> list[Path]:
 def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
     """What the report begins with: how it was made, and the table of claims."""
     properties, agents = machine(), runner.config.agents
+    lengths = ", ".join(str(updates(runner.config, one)) for one in (PRINTED, OURS, BEST))
     tally = {status: sum(c.status == status for c in claims) for status in ("reproduced", "partly", "not", "not run")}
     cells = [(c.text, c.paper, c.ours, c.near, f"**{c.status}**") for c in claims]
     parts = [
@@ -73,9 +74,9 @@ def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
         f"jaxba measures. This file is made by `{command}`; nothing in it is written by hand.",
         f"Machine: {properties['device']}, {properties['processor']}, Python {properties['python']}, "
         f"JAX {properties['jax']}, jaxba {properties['jaxba']}. "
-        f"Agents: {agents.seeds} training runs of each kind, of {updates(runner.config)} updates, all of which enter "
-        "the tables. All arithmetic is in float64. An iteration is one linear solve, accepted or rejected. Means are "
-        "arithmetic, as in the paper; **a failure counts as 100 iterations**.",
+        f"Agents: {agents.seeds} training runs of each kind, all of which enter the tables, of {lengths} updates (as "
+        "printed, tuned, guarded). All arithmetic is in float64. An iteration is one linear solve, accepted or "
+        "rejected. Means are arithmetic, as in the paper; **a failure counts as 100 iterations**.",
         "## Claims",
         "; ".join(f"{count} {status}" for status, count in tally.items()) + f" of {len(claims)}.",
         CRITERION,

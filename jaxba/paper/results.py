@@ -138,6 +138,7 @@ class Row(NamedTuple):
     seeds: int  # training runs; 0 for a rule
     solves: int  # problems or scenes of each training run
     seconds: float = math.nan  # set-up and iterations, without compilation; NaN if that was not measured
+    collapsed: bool = False  # most training runs ended with a policy that does the same in every state
 
 
 def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:

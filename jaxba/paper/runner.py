@@ -16,7 +16,7 @@ import numpy as np
 from jaxba.bench import profile
 from jaxba.bench.run import RunSettings, record_of, run_solver
 from jaxba.bench.sources import Source
-from jaxba.damping import DampingPolicy
+from jaxba.damping import ConstantAction, DampingPolicy, load_policy
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import Bank, reach
 from jaxba.paper import agents, results, zero_net
@@ -28,7 +28,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.loop import IterationRecord
-from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.names import PEERS, SolverName, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.record import Record
 from jaxba.solver.solve import solve
@@ -36,8 +36,8 @@ from jaxba.typing import InputError
 
 LIMIT = profile.ITERATION_LIMIT
 
-ELSEWHERE = "agent-elsewhere"
-"""Name of the agents that are trained on other real problems."""
+ELSEWHERE, CONSTANT = "-elsewhere", "-constant"
+"""Endings of the names of agents that are trained on other real problems, and of twins without learning."""
 
 TEST = "test"
 """Name of the scenes of the tables in records."""
@@ -65,6 +65,12 @@ class Method:
 
     peer: SolverName | None = None
     """Another library that solves real problems, in place of `build`."""
+
+    driver: Callable[[int, Source], Path | None] | None = None
+    """File of the policy of a training run that drives the other library; without one it has its own rule."""
+
+    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False
+    """Whether most of the training runs for these problems ended with a policy that does the same in every state."""
 
     @property
     def numbers(self) -> range:
@@ -107,41 +113,78 @@ class Runner:
         self.done = 0
         """Number of solves, plays and trainings that this process has done."""
         self._read: tuple[Source, BundleProblem] | None = None
+        self._constants: dict[str, ConstantAction] = {}
 
     # Policies
 
-    def agent(self, agent: Agent, method: str = "lm") -> Method:
-        """The method with a trained agent; the agent is trained when the method is first built."""
-        name = agent.name if method == "lm" else f"{method}+{agent.name}"
-        return Method(name, lambda seed, _: self._trained(agent, seed, method), self.config.agents.seeds)
+    def agent(self, kind: Agent, linear: LinearSolverChoice = "auto", method: str = "lm") -> Method:
+        """The method with an agent, which is trained on synthetic scenes when it is first built."""
+        if method != "lm":
+            kind = replace(kind, name=f"{method}+{kind.name}", overrides=(*kind.overrides, f"method={method}"))
+        name = kind.name if linear == "auto" else f"{kind.name}/{linear}"
+        return self._method(name, lambda _: kind, method, linear=linear)
 
-    def agent_trained_elsewhere(self, method: str = "lm") -> Method:
-        """The method with agents trained on windows of real problems other than the one to solve."""
+    def elsewhere(self, kind: Agent, method: str = "lm") -> Method:
+        """The method with agents trained on windows of real problems other than the one to solve, with its steps. The
+        steps of a peer are those of plain LM."""
+        library = parse_solver(method) if method.partition(":")[0] in PEERS else None
+        steps = "lm" if library else method
+        find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, steps)
+        name = f"{kind.name}{ELSEWHERE}"
+        return self._method(name if method == "lm" else f"{method}+{name}", find, method, library)
+
+    def _method(
+        self,
+        name: str,
+        find: Callable[[Source | None], Agent | None],
+        method: str = "lm",
+        library: SolverName | None = None,
+        linear: LinearSolverChoice = "auto",
+    ) -> Method:
+        def file(seed: int, source: Source | None) -> Path | None:
+            agent = find(source)
+            if agent is None:
+                return None
+            self.done += agents.train(self.config, agent, self.folder, self.report)
+            return agents.own_folder(agent, self.folder) / agents.POLICY.format(seed + 1)
 
         def build(seed: int, source: Source | None) -> Built | None:
-            agent = agents.trained_elsewhere(self.config, source) if source else None
-            return agent and self._trained(agent, seed, method)
+            path = file(seed, source)
+            return path and (load_policy(path), SolveOptions(method=method, linear_solver=linear))
 
-        name = ELSEWHERE if method == "lm" else f"{method}+{ELSEWHERE}"
-        return Method(name, build, self.config.agents.seeds)
+        def collapsed(of: Sequence[Source | None]) -> bool:
+            named = {agent.name: agent for source in of if (agent := find(source))}
+            found = [one for agent in named.values() for one in agents.collapsed(self.config, agent, self.folder)]
+            return 2 * sum(found) > len(found)
 
-    def _trained(self, agent: Agent, seed: int, method: str) -> Built:
-        policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.report)
-        self.done += fresh
-        return policy, SolveOptions(method=method)
+        return Method(name, build, self.config.agents.seeds, library, file if library else None, collapsed)
+
+    def twin(self, kind: Agent, linear: LinearSolverChoice = "auto", *, elsewhere: bool = False) -> Method:
+        """The best constant action of an agent on its training scenes, under its guard and with its step."""
+
+        def build(_: int, source: Source | None) -> Built | None:
+            agent = agents.trained_elsewhere(self.config, source, kind) if elsewhere and source else kind
+            if agent is None:
+                return None
+            if agent.name not in self._constants:
+                self._constants[agent.name] = agents.best_constant(self.config, agent, self.folder, self.report)
+            return self._constants[agent.name], SolveOptions(linear_solver=linear)
+
+        name = f"{kind.name}{ELSEWHERE * elsewhere}{CONSTANT}"
+        return Method(name if linear == "auto" else f"{name}/{linear}", build)
 
     def zero_net(self) -> Method:
         """The method with the Zero-net, with as many training runs as an agent."""
         return Method("zero-net", self._zero_net, self.config.agents.seeds)
 
     def _zero_net(self, seed: int, _: Any) -> Built:
-        agent = agents.train_config(self.config, agents.OURS, seed).game.agent
+        agent = agents.train_config(self.config, agents.OURS).game.agent
         path = self.folder / "agents" / f"zero-net-{seed}.npz"
         if path.is_file():
             net = zero_net.restore(path, self.config.zero_net, agent)
         else:
             self.report(f"zero-net {seed + 1}: training")
-            settings = agents.train_config(self.config, agents.OURS, 0)
+            settings = agents.train_config(self.config, agents.OURS)
             train_on = agents.scenes(self.config, self.folder, self.report)[0]
             game = agents.game(self.config, agents.OURS, settings, train_on)
             key = jax.random.fold_in(jax.random.key(self.config.seed), 2000 + seed)
@@ -166,7 +209,7 @@ class Runner:
                 continue
             process.release_programs()
             policy, options = cast(Built, method.build(seed, None))
-            settings = agents.train_config(self.config, agents.OURS, 0)
+            settings = agents.train_config(self.config, agents.OURS)
             options = replace(options, intrinsics=settings.bank.intrinsics).step_options(policy)
             bank = self.test_scenes
             self.report(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
@@ -221,7 +264,13 @@ class Runner:
         self.report(f"{source.name} by {method.label(seed)}")
         if built is None:
             assert method.peer
-            record = run_solver(problem, source, method.peer, repeat, RunSettings(max_iterations=limit))
+            solver = method.peer
+            if method.driver:
+                file = method.driver(seed, source)
+                if file is None:
+                    return
+                solver = replace(solver, policy=str(file), refine_points=None)
+            record = run_solver(problem, source, solver, repeat, RunSettings(max_iterations=limit))
         else:
             policy, options = built
             options = replace(options, max_iterations=limit, compilation="full")
@@ -241,12 +290,12 @@ class Runner:
     def row_on_scenes(self, method: Method) -> Row:
         """The row of a method on the scenes of the tables, from the results so far."""
         plays = [self.store.play(TEST, method.name, seed) for seed in method.numbers]
-        return results.row_of(
-            method.name, {p.seed: results.of_play(p) for p in plays if p is not None}, method.seeds > 0
-        )
+        found = {p.seed: results.of_play(p) for p in plays if p is not None}
+        return self._row(method, found, [None])
 
     def row_on(self, sources: Iterable[Source], method: Method) -> Row:
         """The row of a method on real problems, from the results so far."""
+        sources = list(sources)
         names = [source.name for source in sources]
         best = profile.best_cost(self.store.solves)
         found = {}
@@ -254,7 +303,11 @@ class Runner:
             records = self.store.solves_of(names, [method.label(seed)])
             if records:
                 found[seed] = results.of_records(records, best)
-        return results.row_of(method.name, found, method.seeds > 0)
+        return self._row(method, found, sources)
+
+    def _row(self, method: Method, found: dict[int, list[results.Outcome]], of: Sequence[Source | None]) -> Row:
+        row = results.row_of(method.name, found, method.seeds > 0)
+        return row._replace(collapsed=bool(found) and method.collapsed(of))
 
     def records_on(self, sources: Iterable[Source], methods: Iterable[Method], seed: int = 0) -> list[Record]:
         """Records of solves with one training run of each method, with `Method.name` as the solver."""

@@ -51,9 +51,9 @@ MIN_GAINS = (-5.0, -0.5)
 of the 12 and 17 candidates below was ever accepted."""
 
 ROUNDS_OF_LATER_CANDIDATES = 1
-"""Most camera rounds of a backtracked candidate or a pattern move. Measured on 457 held-out scenes with the policy
-`learned`: 6.40 iterations to within 1e-4 of the best cost with none for backtracked candidates, 6.02 with one, 5.88
-with three; on real problems three took a tenth more work than one."""
+"""Most camera rounds of a backtracked candidate or a pattern move. Measured on 457 held-out scenes with an agent
+for such steps: 6.40 iterations to within 1e-4 of the best cost with none for backtracked candidates, 6.02 with one,
+5.88 with three; on real problems three took a tenth more work than one."""
 
 GAIN_TOLERANCE = 0.25
 """Difference of the gain ratio from one up to which the linear model predicted the step."""

@@ -42,7 +42,7 @@ START_DISTANCES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 last one is the mirror image, for points behind that camera. Chosen once, not fitted."""
 
 POINT_ITERATIONS = 6
-"""Gauss-Newton steps of a point from each start, twice those in an iteration of the learned policy. Chosen once, not
+"""Gauss-Newton steps of a point from each start, twice those of all embedded iterations. Chosen once, not
 fitted."""
 
 EQUIVALENT_STEPS = (1 + len(START_DISTANCES)) * POINT_ITERATIONS // 3

@@ -30,7 +30,7 @@ class SettingsError(InputError):
 
 def names(kind: Kind) -> list[str]:
     """Names that `find` knows, sorted."""
-    return [path.stem for path in visible(_folder(kind)) if path.suffix == ".yaml"]
+    return sorted(path.stem for path in visible(_folder(kind)) if path.suffix == ".yaml")
 
 
 def find(kind: Kind, name: str, folder: Path = Path()) -> Path:

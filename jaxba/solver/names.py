@@ -10,10 +10,10 @@ import re
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast, get_args
 
-from jaxba.damping import DampingPolicy, brings_embedded, make_policy
+from jaxba.damping import DampingPolicy, brings_step, make_policy
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.policy import trained_step
-from jaxba.damping.registry import BOLD, DRIVER, LEARNED, PLAIN, SUFFIX
+from jaxba.damping.registry import SUFFIX
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.solver.options import Dtype, SolveOptions
@@ -40,8 +40,8 @@ class SolverName:
     """Name of the damping policy, see `jaxba.damping.make_policy`."""
 
     refine_points: int | None = 0
-    """Number of embedded point iterations, without any other refinement. None: the full refinement: that a learned
-    policy was trained with, that of `learned` for `bold`, or for a rule (`RULE+embedded`) that of the default agent."""
+    """Number of embedded point iterations, without any other refinement. None: the step that a policy brings (a learned
+    one that of its training), or for a rule (`RULE+embedded`) all embedded iterations."""
 
     dtype: Dtype = DTYPES[0]
     """Floating point type."""
@@ -55,8 +55,8 @@ class SolverName:
     def __str__(self) -> str:
         refinement = ""
         if self.refine_points is None:
-            refinement = "" if brings_embedded(self.policy) else "+embedded"
-        elif self.embeds or brings_embedded(self.policy):
+            refinement = "" if brings_step(self.policy) else "+embedded"
+        elif self.refine_points or brings_step(self.policy):
             refinement = f"+refine{self.refine_points}"
         if self.peer:
             return f"{self.peer}+{self.policy}{refinement}" if self.policy else self.peer
@@ -64,23 +64,17 @@ class SolverName:
         dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
         return f"{method}{self.policy}{refinement}{dtype}"
 
-    @property
-    def embeds(self) -> bool:
-        """Whether there is any refinement of steps."""
-        return self.refine_points != 0
-
     def build(self) -> tuple[DampingPolicy, SolveOptions]:
         """The policy, and the options of the solve.
 
         Raises:
             InputError: as `make_policy`, `make_method`.
         """
-        alone, peer = self.refine_points == 0, bool(self.peer)
-        policy = make_policy(fitting_policy(self.policy, alone=alone, peer=peer))
+        policy = make_policy(self.policy)
         step = trained_step(policy)
         if self.refine_points is not None:
             step = replace(step, refinement=Refinement(points=self.refine_points))
-        elif not brings_embedded(self.policy):
+        elif not brings_step(self.policy):
             step = AgentConfig().step_options(StepOptions())
         return policy, SolveOptions(
             method=self.method, refinement=step.refinement, coordinates=step.coordinates, dtype=self.dtype
@@ -128,15 +122,14 @@ _REFINEMENT = re.compile(r"(.*)\+(?:refine(\d+)|embedded)", re.DOTALL)
 def parse_policy(name: str) -> SolverName:
     """The solver with plain LM in float64 of a name `policy[+refineK|+embedded]`. The policy itself is not checked."""
     policy, refine, stated = split_refinement(name)
-    return SolverName(policy, None if brings_embedded(policy) and not stated else refine)
+    return SolverName(policy, None if brings_step(policy) and not stated else refine)
 
 
 def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, SolveOptions]:
     """The policy of a name `policy[+refineK|+embedded]`, and the options with the refinement that the name states.
 
     Args:
-        name: as in a solver's name. Without an ending, `learned` and `bold` mean their variants for plain steps if the
-            options have a refinement without point iterations.
+        name: as in a solver's name.
         options: options of the solve. Coordinates that they give take precedence over those that come with `+embedded`.
 
     Raises:
@@ -145,30 +138,11 @@ def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, Sol
     """
     policy, _, stated = split_refinement(name)
     if not stated:
-        alone = options.refinement is not None and not options.refinement.points
-        return make_policy(fitting_policy(name, alone=alone)), options
+        return make_policy(name), options
     built, own = parse_policy(name).build()
     if options.refinement not in (None, own.refinement):
         raise ValueError(f"policy {name!r} states its refinement: leave out that of the options, or name {policy!r}")
     return built, replace(options, refinement=own.refinement, coordinates=options.coordinates or own.coordinates)
-
-
-def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> str:
-    """Resolves `learned` and `bold` to the variant for the kind of step.
-
-    `learned` is the shipped policy that performed best for it, and `bold` has the guard of that policy.
-
-    Args:
-        policy: name of a policy, see `make_policy`.
-        alone: whether steps have no refinement, so that lambda is the only choice.
-        peer: whether another library computes the step, with the same damping for cameras and points.
-
-    Returns:
-        A name for `make_policy`; other names than `learned` and `bold` are unchanged.
-    """
-    if policy not in (LEARNED, BOLD) or not alone:
-        return policy
-    return policy + (DRIVER if peer else PLAIN)
 
 
 def parse_solver(name: str) -> SolverName:
@@ -206,7 +180,7 @@ def parse_solver(name: str) -> SolverName:
     if at and dtype not in DTYPES:
         raise InputError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
     make_policy(merged[0])
-    if brings_embedded(merged[0]) and not stated:
+    if brings_step(merged[0]) and not stated:
         refine = None
     return SolverName(merged[0], refine, cast(Dtype, dtype or DTYPES[0]), method)
 

@@ -112,8 +112,7 @@ def solve(
         problem: start of the optimisation.
         policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`). A name may
             end with `+embedded`, all embedded iterations of the default agent around a rule, or `+refineK`, K point
-            iterations and no other refinement. With a refinement without point iterations `learned` and `bold` mean
-            their variants for plain steps.
+            iterations and no other refinement.
         options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
         watch: called before it, with the record and a function that gives the problem with the parameters after the

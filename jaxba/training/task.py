@@ -213,7 +213,7 @@ def baseline_policies(
     Args:
         config: of the run.
         options: of the agent's step.
-        names: as in `BASELINES`, without `CONSTANT`. Those with embedded iterations, `guarded` and `learned` are left
+        names: as in `BASELINES`, without `CONSTANT`. Those with embedded iterations, `guarded` among them, are left
             out if the agent's step has none; the rule that belongs to the method comes first.
     """
     plain = config.step_options
@@ -229,9 +229,9 @@ def baseline_policies(
         if name == BOLD:
             found[name] = boldest(config.game.agent), options
         elif name in (GUARDED, LEARNED):
-            if has_embedded:
-                policy = make_policy(name)
-                made_for = trained_step(policy)
+            policy = make_policy(name)
+            made_for = trained_step(policy)
+            if has_embedded or made_for.refinement == plain.refinement:
                 step = replace(plain, refinement=made_for.refinement, coordinates=made_for.coordinates)
                 found[name] = policy, step
         elif rule == name:

@@ -29,7 +29,7 @@ TINY = [
     "game.agent.pattern_moves=0",
     *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),
 ]
-COMMAND = ["--config", "fast", "--set", *TINY]
+COMMAND = ["--config", "default", "--set", *TINY]
 CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "evaluate_s")
 
 
@@ -99,14 +99,14 @@ def test_a_run_writes_policy_page_log_and_configuration(finished):
         *("config.yaml", "bank.npz", "rules.npz", "metrics.jsonl", "tensorboard", "checkpoints"),
         *("policy.safetensors", "report.html"),
     }
-    assert load(str(finished / "config.yaml")) == load("fast", TINY)
+    assert load(str(finished / "config.yaml")) == load("default", TINY)
     assert [row["chunk"] for row in log.read(finished)] == [1, 2, 3, 4]
     assert log.read(finished)[1]["episode/ceres"] > 0
 
 
 def test_the_policy_file_has_the_best_policy_and_its_origin(finished):
     policy = load_policy(finished / "policy.safetensors")
-    assert policy.config == load("fast", TINY).game.agent
+    assert policy.config == load("default", TINY).game.agent
     scored = [row for row in log.read(finished) if "held_out/score" in row]
     best = min(scored, key=lambda row: row["training/score"])
     with safe_open(finished / "policy.safetensors", framework="numpy") as file:
@@ -115,7 +115,7 @@ def test_the_policy_file_has_the_best_policy_and_its_origin(finished):
     assert metadata["training_score"] == f"{best['training/score']:.4f}"
     assert "cameras: 4" in metadata["config"]
     actor = {"params": {"MLP_0": {f"Dense_{k}": x._asdict() for k, x in enumerate(policy.layers)}}}
-    work = task.build(load("fast", TINY), finished)
+    work = task.build(load("default", TINY), finished)
     assert work.compare([actor])[0]["trained"].mean == pytest.approx(best["held_out/score"], abs=1)
 
 
@@ -225,7 +225,7 @@ def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
     out = str(tmp_path / "run")
     assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
     assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
-    assert "known: bal, default, driver, fast, kitti" in error_of(capsys, "--config", "fastest", "--out", out)
+    assert "known: default, paper, paper-tuned" in error_of(capsys, "--config", "fast", "--out", out)
     assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
     assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
     assert not (tmp_path / "run").exists()

@@ -19,7 +19,7 @@ from safetensors.numpy import save_file
 from support import same_bits, solve
 
 import jaxba
-from jaxba import METHODS, SolveOptions, StepOptions, make_policy, random_scene, scene_like, solve_loop
+from jaxba import SolveOptions, StepOptions, make_policy, random_scene, scene_like, solve_loop
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
@@ -194,7 +194,7 @@ def test_a_policy_that_could_not_be_read_again_is_not_written(tmp_path):
 def test_every_shipped_policy_can_be_used_and_is_small():
     folder = Path(jaxba.__file__).parent / "policies"
     shipped = sorted(folder.glob("*.safetensors"))
-    assert {path.name for path in shipped} >= set(registry.SHIPPED.values())
+    assert registry.SHIPPED in shipped
     for path in shipped:
         assert path.stat().st_size <= LARGEST_FILE
         assert load_policy(path).config.guard == "hand-over"
@@ -232,13 +232,11 @@ def _keys(tree):
 
 @pytest.fixture
 def shipped(tmp_path, monkeypatch):
-    """Policies under the names of the shipped ones, whose own files are not looked at."""
-    files = {}
-    for seed, name in enumerate(registry.SHIPPED):
-        files[name] = str(tmp_path / f"{name}.safetensors")
-        save_policy(files[name], random_policy(seed, replace(AGENT, refine_points=2, trials=3)))
-    monkeypatch.setattr(registry, "SHIPPED", files)
-    return files
+    """A policy with embedded iterations in the place of the shipped one, whose own file is not looked at."""
+    file = tmp_path / "shipped.safetensors"
+    save_policy(file, random_policy(0, replace(AGENT, refine_points=2, trials=3)))
+    monkeypatch.setattr(registry, "SHIPPED", file)
+    return file
 
 
 @pytest.mark.parametrize(
@@ -247,7 +245,6 @@ def shipped(tmp_path, monkeypatch):
         ("learned", SolverName("learned", None)),
         ("learned+refine0", SolverName("learned", 0)),
         ("learned+refine3", SolverName("learned", 3)),
-        ("learned-plain", SolverName("learned-plain", None)),
         ("learned@float32", SolverName("learned", None, "float32")),
         ("learned+refine3@mixed", SolverName("learned", 3, "mixed")),
         ("ceres+embedded", SolverName("ceres", None)),
@@ -282,12 +279,12 @@ def test_the_path_of_a_policy_is_a_name(tmp_path, folder):
 
 def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned").build()
-    chex.assert_trees_all_equal(policy.layers, load_policy(shipped["learned"]).layers, strict=True)
+    chex.assert_trees_all_equal(policy.layers, load_policy(shipped).layers, strict=True)
     coordinates = Coordinates(lens_step="pixels")
     embedded = Refinement(2, "rays", trials=3, camera_rounds=AGENT.camera_rounds, pattern_moves=1, previous_steps=3)
     assert options == SolveOptions(refinement=embedded, coordinates=coordinates)
     policy, options = parse_solver("learned+refine0").build()
-    chex.assert_trees_all_equal(policy.layers, load_policy(shipped["learned-plain"]).layers, strict=True)
+    chex.assert_trees_all_equal(policy.layers, load_policy(shipped).layers, strict=True)
     assert options == SolveOptions(refinement=Refinement(), coordinates=coordinates)
     assert parse_solver("learned+refine3").build()[1] == replace(options, refinement=Refinement(points=3))
     options = parse_solver("ceres+refine3").build()[1]
@@ -296,32 +293,15 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     assert options.step_options(policy) == AgentConfig().step_options(StepOptions())
 
 
-def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
-    """Each with the camera damping that it was trained with: another library has none."""
-    expected = load_policy(shipped["learned"]).layers
-    for method in (*METHODS, "stba:3"):
-        chex.assert_trees_all_equal(parse_solver(f"{method}+learned").build()[0].layers, expected, strict=True)
-        chex.assert_trees_all_equal(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected, strict=True)
-        alone = parse_solver(f"{method}+learned+refine0").build()[0]
-        chex.assert_trees_all_equal(alone.layers, load_policy(shipped["learned-plain"]).layers, strict=True)
-    driver = parse_solver("pyceres:dense+learned+refine0").build()[0]
-    chex.assert_trees_all_equal(driver.layers, load_policy(shipped["learned-driver"]).layers, strict=True)
-    chex.assert_trees_all_equal(parse_solver("pyceres:dense+learned").build()[0].layers, expected, strict=True)
+def test_the_shipped_policy_is_wired_as_the_preset_of_its_files_name():
+    assert load_policy(registry.SHIPPED).config == load(registry.SHIPPED.stem).game.agent
 
 
-@pytest.mark.parametrize("name", registry.SHIPPED)
-def test_a_shipped_policy_is_wired_as_the_preset_of_its_files_name(name):
-    """So none can be taken for another: they differ in their camera damping or their embedded iterations."""
-    path = Path(jaxba.__file__).parent / "policies" / registry.SHIPPED[name]
-    assert load_policy(path).config == load(path.stem).game.agent
-    others = {load(Path(file).stem).game.agent for file in registry.SHIPPED.values()}
-    assert len(others) == len(set(registry.SHIPPED.values()))
-
-
-def test_the_policy_that_drives_another_library_damps_cameras_as_points():
+def test_the_shipped_policy_chooses_lambda_alone_and_damps_cameras_as_points():
     """Which is all that Ceres' one radius can do."""
-    policy, options = parse_solver("pyceres:dense+learned+refine0").build()
-    assert policy.config.camera_damping == options.coordinates.camera_damping == 1
+    for name in ("learned", "pyceres:dense+learned"):
+        policy, options = parse_solver(name).build()
+        assert options.step_options(policy) == StepOptions()
 
 
 @pytest.mark.parametrize("refine", [None, 0, 4])

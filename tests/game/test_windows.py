@@ -104,10 +104,10 @@ def test_problems_without_classes_and_classes_without_problems_are_refused(file)
 
 
 def test_a_configuration_with_problems_has_windows_in_their_classes_or_in_all(file):
-    alone = configs.with_problems(configs.load("fast"), [file])
+    alone = configs.with_problems(configs.load("default"), [file])
     assert [kind.family for kind in alone.bank.classes] == ["windows"]
     classes = "bank.classes=[{cameras: 4, points: 12}, {cameras: 6, points: 20, family: windows}]"
-    mixed = configs.load("fast", [classes, "bank.scenes=[50, 50]", "envs=[8, 8]", f"bank.problems=[{file}]"])
+    mixed = configs.load("default", [classes, "bank.scenes=[50, 50]", "envs=[8, 8]", f"bank.problems=[{file}]"])
     assert [kind.family for kind in configs.with_problems(mixed, [file]).bank.classes] == ["wide", "windows"]
 
 

@@ -165,7 +165,7 @@ def test_pixels_of_every_camera_model_are_colmaps(kind):
 )
 def test_a_solve_ends_where_colmaps_own_bundle_adjustment_does(tmp_path, kinds):
     folder = write(model_of(kinds), tmp_path / "model")
-    solution = solve(read_problem(folder), "learned")
+    solution = solve(read_problem(folder), "bold")
     assert solution.converged
     write_colmap(solution.problem, tmp_path / "out", like=folder)
     truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True)
@@ -274,7 +274,7 @@ def test_a_benchmark_takes_models_and_skips_what_a_solver_refuses(tmp_path, caps
 
 def test_point_errors_in_the_written_model_are_those_of_the_solution(tmp_path):
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
-    write_colmap(solve(read_problem(folder), "learned").problem, tmp_path / "out", like=folder)
+    write_colmap(solve(read_problem(folder), "bold").problem, tmp_path / "out", like=folder)
     model = pycolmap.Reconstruction(str(tmp_path / "out"))
     point = model.point3D(1)
     errors = []
@@ -502,7 +502,7 @@ def test_real_models_have_colmaps_cost(name):
 @pytest.mark.parametrize("name", REAL)
 def test_real_models_end_no_higher_than_after_colmaps_own_bundle_adjustment(tmp_path, name):
     folder = f"{DATA}/colmap/{name}"
-    solution = solve(read_problem(folder), "learned")
+    solution = solve(read_problem(folder), "bold")
     assert solution.converged
     write_colmap(solution.problem, tmp_path / "out", like=folder)
     truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=name != "ranjith")
@@ -514,7 +514,7 @@ def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
     problem = read_problem(folder)
     rng = np.random.default_rng(2)
     far: BundleProblem = problem.replace(points=problem.points + rng.normal(scale=0.3, size=problem.points.shape))
-    near = solve(problem, "learned").final_cost
+    near = solve(problem, "bold").final_cost
     options = SolveOptions(refinement=Refinement(points=3))
     np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)
 

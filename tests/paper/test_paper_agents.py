@@ -13,6 +13,7 @@ from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig,
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
 from jaxba.paper.tables_and_figures.figures import small_scene
+from jaxba.training.config import load
 
 CONFIG = config.load("fast")
 
@@ -29,18 +30,21 @@ CONFIG = config.load("fast")
     ],
 )
 def test_agents_differ_only_in_the_settings_that_their_table_compares(agent, changed):
-    ours, theirs = (agents.train_config(CONFIG, one, 0) for one in (agents.OURS, agent))
+    ours, theirs = (agents.train_config(CONFIG, one) for one in (agents.OURS, agent))
     assert sorted(settings.differences(ours, theirs)) == changed
 
 
-def test_seeds_are_training_runs_of_one_agent_each():
-    first, second = (agents.train_config(CONFIG, agents.OURS, seed) for seed in (0, 1))
-    assert settings.differences(first, second) == ["seed"]
-    assert first.seeds == 1
+def test_all_kinds_of_agents_are_trained_on_the_same_scenes_side_by_side():
+    printed, ours, best = (agents.train_config(CONFIG, one) for one in (agents.PRINTED, agents.OURS, agents.BEST))
+    assert printed.bank == ours.bank == best.bank
+    assert printed.seeds == ours.seeds == best.seeds == CONFIG.agents.seeds
+    whole = load(agents.BEST.preset)
+    assert best.chunks == round(CONFIG.agents.length * whole.chunks)
+    assert best.game == whole.game
 
 
 def test_ours_is_the_papers_agent():
-    found = agents.train_config(CONFIG, agents.OURS, 0)
+    found = agents.train_config(CONFIG, agents.PRINTED)
     assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "duration")
     assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (10.0, 500, "value", 256)
     assert (found.sac.layers, found.sac.policy_layers) == (2, 3)  # and a linear one: three and four fully connected
@@ -94,7 +98,7 @@ def test_the_scenes_of_the_tables_are_not_used_in_training(split, monkeypatch, t
 @pytest.mark.slow
 def test_the_agent_with_few_scenes_trains_on_the_first_ones(split):
     few = PaperConfig(agents=AgentsConfig(trajectories=3))
-    wanted = agents.train_config(few, agents.FEW, 0)
+    wanted = agents.train_config(few, agents.FEW)
     game = agents.game(few, agents.FEW, wanted, split.train)
     np.testing.assert_array_equal(game.banks[0].initial_cost, split.train.initial_cost[:3])
     assert game.options == StepOptions(intrinsics="fixed")

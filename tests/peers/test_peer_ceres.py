@@ -30,6 +30,7 @@ from jaxba import (
     read_problem,
 )
 from jaxba.bench import report
+from jaxba.bench.run import embedded_step
 from jaxba.cli.bench import run as run_bench
 from jaxba.io import json_lines
 from jaxba.problem import geometry
@@ -270,7 +271,7 @@ def test_a_rejected_step_changes_no_bit():
     assert same_bits(before, colmap.parameters())
 
 
-@pytest.mark.parametrize("name", ["learned-driver", "ceres", "classic"])
+@pytest.mark.parametrize("name", ["learned", "ceres", "classic"])
 def test_a_policy_does_the_same_with_the_steps_of_ceres_and_of_jaxba(name):
     policy = make_policy(name)
     found = drive_ceres(support.tiny(), "dense", policy)
@@ -289,7 +290,7 @@ def test_a_policy_that_is_rejected_goes_on_from_the_same_state():
     np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["ceres", "learned"])
+@pytest.mark.parametrize("name", ["ceres", "bold"])
 def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
     jax.clear_caches()
     before = []
@@ -298,7 +299,7 @@ def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
         monkeypatch.setattr(Run, "start", lambda run: (before.append(clock.seconds), start(run)))
         solver = parse_solver(f"pyceres:dense+{name}")
         policy, options = solver.build()
-        drive_ceres(support.tiny(), "dense", policy, embedded=options.step_options(policy) if solver.embeds else None)
+        drive_ceres(support.tiny(), "dense", policy, embedded=embedded_step(policy, options))
         assert clock.seconds == before[0] > 0
 
 
@@ -309,7 +310,7 @@ def test_every_lambda_is_possible(damping):
     assert found.final_cost <= found.initial_cost
 
 
-@pytest.mark.parametrize("name", ["learned", "ceres+embedded", "classic+refine2"])
+@pytest.mark.parametrize("name", ["bold", "ceres+embedded", "classic+refine2"])
 @pytest.mark.parametrize("make", [support.tiny, lambda: scattered(7)])
 def test_with_embedded_iterations_ceres_and_jaxba_do_the_same(name, make):
     policy, options = built(f"pyceres:dense+{name}")
@@ -348,7 +349,7 @@ def test_a_rejected_step_with_embedded_iterations_changes_no_bit():
 
 @pytest.mark.parametrize("mode", ["sparse", "iterative"])
 def test_other_modes_take_embedded_iterations_and_report_conjugate_gradients(mode):
-    policy, options = built(f"pyceres:{mode}+learned")
+    policy, options = built(f"pyceres:{mode}+bold")
     terms = []
     note = lambda record: terms.append(float(record.step.forcing))
     found = drive_ceres(support.tiny(), mode, policy, embedded=options, callback=note)
@@ -467,7 +468,7 @@ def test_a_backend_names_its_versions():
 
 def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
-    names = ["ceres", "pyceres:sparse", *(f"pyceres:dense+{name}" for name in ("ceres", "learned+refine0", "learned"))]
+    names = ["ceres", "pyceres:sparse", *(f"pyceres:dense+{name}" for name in ("ceres", "learned", "bold"))]
     argv = ["scene:tiny", "--solvers", ",".join(names), "--repeats", "1", "--out", str(tmp_path)]
     assert run_bench(argv) == 0
     ours, *peers = json_lines.read(tmp_path / "results.jsonl", Record)
@@ -490,7 +491,7 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [IN_FRONT[1]])
 def test_real_problems_end_as_with_the_steps_of_jaxba_where_iterations_are_embedded(name):
-    policy, options = built("pyceres:dense+learned")
+    policy, options = built("pyceres:dense+bold")
     found = drive_ceres(real(name), "dense", policy, embedded=options)
     ours = solve(real(name), policy, on_the_manifold(options))
     assert found.termination.converged
@@ -543,7 +544,7 @@ def test_real_costs_of_ceres_alone_are_those_of_jaxba_under_its_lambdas(name):
 @needs_data
 @pytest.mark.slow
 def test_the_learned_policy_does_the_same_with_ceres_on_ladybug_where_points_move_behind_cameras():
-    policy = make_policy("learned-driver")
+    policy = make_policy("learned")
     found = drive_ceres(real(LADYBUG), "dense", policy, max_iterations=12)
     ours = solve(real(LADYBUG), policy, MANIFOLD, max_iterations=12)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)

@@ -67,20 +67,18 @@ def test_what_is_no_peer_is_one_clear_line(text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_without_embedded_iterations_a_policy_for_lambda_alone_drives_a_peer():
-    policy, options = parse_solver("pyceres:dense+learned+refine0").build()
+@pytest.mark.parametrize("name", ["learned", "learned+refine0"])
+def test_the_learned_policy_drives_a_peer_without_embedded_iterations(name):
+    policy, options = parse_solver(f"pyceres:dense+{name}").build()
     assert isinstance(policy, LearnedPolicy)
-    assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
     assert options.step_options(policy) == StepOptions()
 
 
-def test_a_learned_policy_brings_its_embedded_iterations_to_a_peer():
-    policy, options = parse_solver("pyceres:dense+learned").build()
-    ours, same = parse_solver("learned").build()
-    assert isinstance(policy, LearnedPolicy)
-    assert isinstance(ours, LearnedPolicy)
-    assert policy.config == ours.config
-    assert options == same
+def test_a_policy_brings_its_embedded_iterations_to_a_peer():
+    policy, options = parse_solver("pyceres:dense+bold").build()
+    ours, same = parse_solver("bold").build()
+    assert (policy, options) == (ours, same)
+    assert options.step_options(policy).refinement.points
 
 
 def test_every_peer_says_what_brings_it():

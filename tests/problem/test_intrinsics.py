@@ -135,7 +135,7 @@ def test_the_promised_decrease_and_the_gradient_are_those_of_the_problem_with_sh
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", ["ceres", "learned"])
+@pytest.mark.parametrize("policy", ["ceres", "bold"])
 def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
     problem = shared()
     copies = copy_matrix(problem)
@@ -153,7 +153,7 @@ def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
     np.testing.assert_allclose(solution.final_cost, geometry.cost(solution.problem), rtol=1e-10)
 
 
-@pytest.mark.parametrize("policy", ["ceres", pytest.param("learned", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("policy", ["ceres", pytest.param("bold", marks=pytest.mark.slow)])
 def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_bit(policy):
     problem = unseen()
     after = solve(problem, policy).problem
@@ -171,7 +171,7 @@ def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_
 def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
     problem = support.tiny()
     own = with_lenses(problem, np.arange(6), np.ones((6, 3), bool))
-    plain, same = solve(problem, "learned"), solve(own, "learned")
+    plain, same = solve(problem, "bold"), solve(own, "learned")
     np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-9)  # two programs
 
 
@@ -186,7 +186,7 @@ def test_a_long_sequence_with_one_lens_is_solved():
     layout = build_layout(scene)
     assert layout.pairs is not None
     assert layout.pairs.band is not None
-    solution = solve(with_lenses(scene, *one_lens), "learned", linear_solver="explicit")
+    solution = solve(with_lenses(scene, *one_lens), "bold", linear_solver="explicit")
     assert solution.converged
     assert solution.final_cost < geometry.cost(true.replace(observations=scene.observations))
     assert np.ptp(solution.problem.cameras[:, 6:], axis=0).max() == 0
@@ -200,7 +200,7 @@ def test_a_long_sequence_with_one_lens_is_solved():
 
 def test_fixed_intrinsics_are_fixed_whoever_shares_them():
     problem = shared()
-    after = solve(problem, "learned", StepOptions(intrinsics="fixed", refinement=Refinement(points=3))).problem
+    after = solve(problem, "bold", StepOptions(intrinsics="fixed", refinement=Refinement(points=3))).problem
     assert (after.cameras[:, 6:] == problem.cameras[:, 6:]).all()
 
 

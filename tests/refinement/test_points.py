@@ -295,7 +295,7 @@ def test_points_of_a_street_stay_in_front_of_their_cameras():
     """kittistereo00s: without a previous place to return to, it ended at 2952 with 61 observations behind."""
     folder = bal_file("x").parent.parent / "bal-converted"
     problem = read_bal(folder / "kittistereo00s-77-15638-pre.txt.bz2")
-    solution = solve(problem, "learned")
+    solution = solve(problem, "bold")
     assert (depths(problem) > 0).all()
     assert (depths(solution.problem) > 0).mean() > 0.9999
     assert solution.final_cost < 2904

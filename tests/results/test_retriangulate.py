@@ -132,7 +132,7 @@ def test_a_cost_that_is_not_finite_is_refused():
 
 
 STRANDING = solve_options(refinement=Refinement(points=3))
-"""A step that leaves a point in the valley where it is; `learned` looks where its rays meet."""
+"""A step that leaves a point in the valley where it is; `bold` looks where its rays meet."""
 
 
 def one_diverged() -> BundleProblem:
@@ -151,7 +151,7 @@ def no_search(_) -> None:
 
 @pytest.mark.slow
 def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
-    np.testing.assert_allclose(solve(one_diverged(), "learned").final_cost, geometry.cost(solved()), rtol=1e-6)
+    np.testing.assert_allclose(solve(one_diverged(), "bold").final_cost, geometry.cost(solved()), rtol=1e-6)
     assert jaxba.solve(one_diverged(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
 
 

@@ -56,13 +56,13 @@ def test_this_jaxlib_compiles_at_the_lower_level():
     "how",
     [
         {"policy": "ceres"},
-        {"policy": "learned"},
-        {"policy": "learned", "method": "stba"},
-        {"policy": "learned", "method": "deeplm"},
-        {"policy": "learned", "linear_solver": "sparse"},
-        {"policy": "learned", "linear_solver": "implicit"},
+        {"policy": "bold"},
+        {"policy": "bold", "method": "stba"},
+        {"policy": "bold", "method": "deeplm"},
+        {"policy": "bold", "linear_solver": "sparse"},
+        {"policy": "bold", "linear_solver": "implicit"},
         {"policy": "ceres", "method": "poba"},
-        {"policy": "learned", "pad": True},
+        {"policy": "bold", "pad": True},
     ],
     ids=str,
 )
@@ -91,7 +91,7 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
     jax.clear_caches()
     with Compilations() as seen:
         watch = lambda record: late.append(len(set(seen.names) - {"camera_round"}))
-        solved = solve(problem, "learned", **how, max_iterations=4, callback=watch)
+        solved = solve(problem, "bold", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
     assert late == [len(set(seen.names) - {"camera_round"})] * 4
     assert {"propose", "take_step", "try_candidate"} <= set(seen.names)
@@ -136,9 +136,9 @@ def test_candidates_one_by_one_are_those_of_the_loop(level):
 def test_camera_rounds_are_compiled_where_a_step_has_some():
     jax.clear_caches()
     with Compilations() as seen:
-        solved = solve(support.tiny(), "learned", compilation="quick")
+        solved = solve(support.tiny(), "bold", compilation="quick")
         assert "camera_round" not in seen.names
-        hard = solve(support.strayed(50.0), "learned", compilation="quick")
+        hard = solve(support.strayed(50.0), "ceres+embedded", compilation="quick")
     assert solved.converged
     assert hard.accepted
     assert seen.names.count("camera_round") == 1

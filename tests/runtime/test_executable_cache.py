@@ -89,11 +89,11 @@ def call(x, power=1):
 @pytest.mark.parametrize(
     "how",
     [
-        {"policy": "learned", "compilation": "auto"},
+        {"policy": "bold", "compilation": "auto"},
         {"policy": "ceres", "dtype": "mixed"},
-        {"policy": "learned", "method": "stba"},
+        {"policy": "bold", "method": "stba"},
         {"policy": "ceres", "linear_solver": "implicit"},
-        {"policy": "learned", "pad": True},
+        {"policy": "bold", "pad": True},
     ],
     ids=str,
 )

@@ -134,8 +134,8 @@ def learn():
     "run",
     [
         lambda: solved(policy="ceres", compilation="full"),
-        lambda: solved(policy="learned", callback=lambda record: None),
-        lambda: solved(policy="learned", linear_solver="implicit", compilation="full"),
+        lambda: solved(policy="bold", callback=lambda record: None),
+        lambda: solved(policy="bold", linear_solver="implicit", compilation="full"),
         lambda: solved(policy="ceres", method="stba", compilation="full"),
         lambda: solved(policy="ceres", method="deeplm", compilation="full"),
         lambda: solve(support.odd(), "ceres", SolveOptions(max_iterations=1)),

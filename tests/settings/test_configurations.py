@@ -44,7 +44,7 @@ def test_every_folder_of_configurations_is_a_kind():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_of_the_repository_is_found_by_its_name_and_as_a_path(kind):
-    files = sorted((REPOSITORY / "configs" / kind).glob("*.yaml"))
+    files = sorted((REPOSITORY / "configs" / kind).glob("*.yaml"), key=lambda file: file.stem)
     assert names(kind) == [file.stem for file in files] != []
     for file in files:
         assert find(kind, file.stem).samefile(file)
@@ -97,14 +97,14 @@ def test_a_base_is_a_name_or_a_path_relative_to_the_file(tmp_path, monkeypatch):
 
 
 def test_what_is_read_is_the_readers_own():
-    read("train", "plain")["game"]["agent"]["trials"] = 7
-    assert read("train", "plain")["game"]["agent"]["trials"] == 1
+    read("train", "default")["game"]["agent"]["trials"] = 7
+    assert read("train", "default")["game"]["agent"]["trials"] == 1
 
 
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"a": "extends: plane"}, "{0}/a.yaml: extends: no configuration 'plane'; known: bal, default"),
+        ({"a": "extends: plane"}, "{0}/a.yaml: extends: no configuration 'plane'; known: default, paper"),
         ({"a": "extends: b.yaml"}, "{0}/a.yaml: extends: b.yaml: No such file or directory"),
         ({"a": "extends: ./"}, "{0}/a.yaml: extends: ./: Is a directory"),
         ({"a": "extends: [plain]"}, "{0}/a.yaml: extends must be a name or the path of a file, is ['plain']"),

@@ -68,17 +68,17 @@ def test_a_solve_with_defaults_is_what_the_command_writes(tmp_path):
 
 
 def test_a_loss_leaves_the_step_that_the_policy_was_trained_with():
-    trained = trained_step(make_policy("learned"))
+    trained = trained_step(make_policy("bold"))
     assert trained.refinement != Refinement()
-    found = prepare(support.tiny(), "learned", SolveOptions(loss=Loss("huber", 2.0))).options
+    found = prepare(support.tiny(), "bold", SolveOptions(loss=Loss("huber", 2.0))).options
     assert found.loss == Loss("huber", 2.0)
     assert (found.refinement, found.coordinates) == (trained.refinement, trained.coordinates)
 
 
 def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
-    trained, loss = trained_step(make_policy("learned")), Loss("huber", 2.0)
+    trained, loss = trained_step(make_policy("bold")), Loss("huber", 2.0)
     spelled_out = SolveOptions(loss=loss, refinement=trained.refinement, coordinates=trained.coordinates)
-    found, expected = (jaxba.solve(support.tiny(), "learned", o) for o in (SolveOptions(loss=loss), spelled_out))
+    found, expected = (jaxba.solve(support.tiny(), "bold", o) for o in (SolveOptions(loss=loss), spelled_out))
     chex.assert_trees_all_equal(found.history, expected.history, strict=True)
 
 

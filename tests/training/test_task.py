@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 
 from jaxba import make_policy
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.learned import boldest
 from jaxba.training.config import load
 from jaxba.training.task import BASELINES, CONSTANT, baseline_policies
+
+EMBEDDED = tuple(
+    f"game.agent.{field.name}={field.default}"
+    for field in fields(AgentConfig)
+    if field.name not in ("observation", "guard", "min_gain")
+)
+"""An agent whose step has embedded iterations, as those of `AgentConfig`."""
 
 NAMES = tuple(name for name in BASELINES if name != CONSTANT)
 
@@ -21,7 +29,7 @@ def found(preset: str, *overrides: str):
 
 
 def test_rules_have_plain_steps_or_the_agents_embedded_iterations():
-    config, options, policies = found("default")
+    config, options, policies = found("default", *EMBEDDED)
     assert tuple(policies) == NAMES
     assert policies["ceres"] == (make_policy("ceres"), config.step_options)
     assert policies["ceres+embedded"] == (make_policy("ceres"), options)
@@ -29,14 +37,14 @@ def test_rules_have_plain_steps_or_the_agents_embedded_iterations():
 
 
 def test_what_ships_has_its_own_step_on_the_games_unknowns():
-    _, options, policies = found("bal", "bank.intrinsics=fixed")
+    config, options, policies = found("default", *EMBEDDED, "bank.intrinsics=fixed")
     policy, step = policies["guarded"]
     assert policy == make_policy("guarded")
     assert step == replace(options, refinement=replace(options.refinement, points=1))
-    assert policies["learned"][1] == options
+    assert policies["learned"] == (make_policy("learned"), config.step_options)
 
 
-@pytest.mark.parametrize("preset", ["default", "plain", "paper"])
+@pytest.mark.parametrize("preset", ["default", "paper"])
 def test_bold_has_the_guard_and_the_step_of_the_game(preset):
     config, options, policies = found(preset, "game.agent.escalate=0.75")
     assert policies["bold"] == (boldest(config.game.agent), options)
@@ -44,9 +52,9 @@ def test_bold_has_the_guard_and_the_step_of_the_game(preset):
 
 
 def test_without_embedded_iterations_only_plain_steps_and_bold_are_left():
-    _, _, policies = found("plain")
-    assert list(policies) == ["ceres", "classic", "gtsam", "gauss-newton", "schedule", "bold"]
+    _, _, policies = found("default")
+    assert list(policies) == ["ceres", "classic", "gtsam", "gauss-newton", "schedule", "bold", "learned"]
 
 
 def test_the_rule_of_the_method_comes_first():
-    assert list(found("default", "method=stba")[2]) == ["stba", *NAMES]
+    assert list(found("default", *EMBEDDED, "method=stba")[2]) == ["stba", *NAMES]

@@ -11,7 +11,7 @@ from jaxba.paper.claims import Statement, order_claim, ratio_claim, success_clai
 from jaxba.paper.config import PAPER_STATE
 from jaxba.paper.results import average_schedule
 from jaxba.paper.runner import Built, Method, Runner
-from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, SCENES, Line, Part, Table, named
+from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, SCENES, Line, Part, Table, named, ours
 from jaxba.solver.options import SolveOptions
 
 STATE_SIZES = {1: 7.5, 5: 4.0, 10: 4.5, 20: 5.0}
@@ -31,19 +31,15 @@ def _ablation(
     statements: Callable[[Runner], list[Statement]],
     text: Callable[[Runner], str],
 ) -> Table:
-    """The same lines and claims on the scenes of the tables and on BAL, after the paper's baseline and Ceres' rule."""
+    """The same lines and claims on the scenes of the tables and on BAL, after the paper's baseline and Ceres' rule, and
+    before our agents. The tuned one is that with which each ablation is compared."""
 
     def parts(runner: Runner) -> list[Part]:
-        every = [named("classic", CLASSIC, 20.0), named("Ceres' rule", CERES), *lines(runner)]
+        every = [named("classic", CLASSIC, 20.0), named("Ceres' rule", CERES), *lines(runner), *ours(runner, 4.0)]
         sets = SCENES, real_problems.bal(runner.config.real)
         return [Part(problems, every, statements(runner)) for problems in sets]
 
     return Table(name, title, heading, text, parts)
-
-
-def _ours(runner: Runner) -> Line:
-    """Line of the agent with which each ablation is compared."""
-    return Line("ours: 5 errors, -1 an iteration, bonus", runner.agent(agents.OURS), 4.0)
 
 
 def _zero_text(runner: Runner) -> str:
@@ -58,7 +54,8 @@ def _zero_text(runner: Runner) -> str:
 
 
 def _sized(runner: Runner) -> list[Line]:
-    sizes = {size: agents.with_state_size(size) for size in runner.config.agents.state_sizes}
+    others = [size for size in runner.config.agents.state_sizes if size != PAPER_STATE]
+    sizes = {size: agents.with_state_size(size) for size in others}
     lines = [Line(f"ours, last {size} errors", runner.agent(agent)) for size, agent in sizes.items()]
     return [x._replace(paper=STATE_SIZES.get(size, x.paper)) for size, x in zip(sizes, lines, strict=True)]
 
@@ -81,7 +78,6 @@ def _scheduled(runner: Runner) -> list[Line]:
         named("schedule, the paper's values", "schedule", 12.0),
         Line("schedule, averages of our agent", Method(AVERAGE, build), 12.0),
         named("Gauss-Newton: 1e-10 throughout", "gauss-newton"),
-        _ours(runner),
     ]
 
 
@@ -101,7 +97,7 @@ TABLES = (
         "zero-net",
         "Table: comparison with the non-holistic Zero-net",
         "Zero-net: the next error instead of the whole solve",
-        lambda runner: [Line("Zero-net", runner.zero_net(), 8.0), _ours(runner)],
+        lambda runner: [Line("Zero-net", runner.zero_net(), 8.0)],
         lambda _: [
             Statement(order_claim, "The agent beats the Zero-net ({})", "4 against 8", OURS, "zero-net"),
             Statement(
@@ -125,10 +121,7 @@ TABLES = (
         "reversed",
         "Table: reversed roles of state and reward",
         "Reversed roles",
-        lambda runner: [
-            _ours(runner),
-            Line("reversed: 5 durations, error", runner.agent(agents.REVERSED), 10.0),
-        ],
+        lambda runner: [Line("reversed: 5 durations, error", runner.agent(agents.REVERSED), 10.0)],
         lambda _: [
             Statement(order_claim, "Reversed roles accelerate less ({})", "4 against 10", OURS, REVERSED),
             Statement(ratio_claim, "Reversed roles still halve classic's iterations ({})", 0.5, REVERSED, CLASSIC),
@@ -147,7 +140,6 @@ TABLES = (
         "Rewards",
         lambda runner: [
             Line("reward: minus the duration by the clock", runner.agent(agents.CLOCK), 4.0),
-            Line("reward: -1", runner.agent(agents.OURS), 5.0),
             Line("reward: nothing, bonus shrinking by 1 %", runner.agent(agents.REDUCTION), 4.2),
         ],
         lambda _: [

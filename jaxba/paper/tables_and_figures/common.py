@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from jaxba.bench.profile import ITERATION_LIMIT
 from jaxba.bench.tables import number, percentage
+from jaxba.paper.agents import BEST, OURS, PRINTED
 from jaxba.paper.claims import Claim, Statement, judge
 from jaxba.paper.real_problems import Problems
 from jaxba.paper.results import Row
@@ -38,6 +39,19 @@ class Line(NamedTuple):
 def named(label: str, solver: str, paper: float = math.nan, paper_s: float = math.nan) -> Line:
     """The line of a solver with a name of `jaxba-bench`."""
     return Line(label, method_named(solver), paper, paper_s)
+
+
+def ours(runner: Runner, paper: float = math.nan, paper_s: float = math.nan, *, elsewhere: bool = False) -> list[Line]:
+    """The four lines of every table: the paper's agent as printed and as tuned, the best agent for lambda alone, and
+    its twin without learning; trained on synthetic scenes, or elsewhere: on real problems other than the one to
+    solve."""
+    made = runner.elsewhere if elsewhere else runner.agent
+    return [
+        Line("the paper's agent, as printed", made(PRINTED)),
+        Line("ours: the paper's agent, tuned", made(OURS), paper, paper_s),
+        Line("ours: scale-free state and guard", made(BEST), paper, paper_s),
+        Line("its twin: best constant lambda", runner.twin(BEST, elsewhere=elsewhere)),
+    ]
 
 
 @dataclass(frozen=True)
@@ -173,7 +187,8 @@ def _comparison(lines: Sequence[Line], rows: Mapping[str, Row]) -> str:
         spread = "rule" if row.solves else "-"
         if row.seeds:
             spread = f"{row.seeds}: {format_iterations(row.low)} to {format_iterations(row.high)}"
-        cells = [line.label, format_iterations(line.paper), format_iterations(row.iterations), spread]
+        label = f"{line.label} (collapsed)" if row.collapsed else line.label
+        cells = [label, format_iterations(line.paper), format_iterations(row.iterations), spread]
         cells += [percentage(row.success), format_iterations(row.near), percentage(row.good_ends)]
         cells += [number(x, 2) for x in (line.paper / papers, over(row, CLASSIC), over(row, CERES))]
         cells += [number(line.paper_s, 4), number(row.seconds, 3)] if timed else []

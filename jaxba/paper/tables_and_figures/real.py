@@ -7,13 +7,16 @@ from collections.abc import Iterable, Sequence
 
 from jaxba.bench.sources import Source
 from jaxba.paper import claims, real_problems
-from jaxba.paper.agents import FEW, OURS, updates
+from jaxba.paper.agents import BEST, FEW, OURS
 from jaxba.paper.claims import Statement, ratio_claim, success_claim, time_claim
 from jaxba.paper.runner import ELSEWHERE, Runner, method_named
-from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Line, Part, Table, named
+from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Line, Part, Table, named, ours
 
-CERES_ITSELF, CERES_WITH_OURS = "pyceres:sparse", "pyceres:sparse+learned+refine0"
-"""Ceres under its own rule, and with our lambda; both need the extra `ceres`."""
+CERES_ITSELF = "pyceres:sparse"
+"""Ceres under its own rule; needs the extra `ceres`."""
+
+TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"
+"""Names of our agents, trained elsewhere."""
 
 MSE_DIFFERENCE = 0.003
 """Largest difference of the mean squared errors of DeepLM's solver with and without ours. Source: the paper, after the
@@ -31,9 +34,8 @@ def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
     if not parts:
         return "There is no other problem of this data set on this machine to train an agent on."
     return (
-        "The agents of this table are trained on windows of up to 10 cameras and 40 points, poses and points unknown, "
-        f"for {updates(runner.config)} updates with the reward by the clock (section on rewards), and judged on "
-        f"problems that the windows are not of: {'; '.join(parts)}."
+        "The agents of this table are trained on windows of up to 10 cameras and 40 points, with the steps that they "
+        f"drive, and judged on problems that the windows are not of: {'; '.join(parts)}."
     )
 
 
@@ -46,17 +48,21 @@ def _kitti(runner: Runner) -> list[Part]:
         named("STBA", "stba+stba", 80.0, 287.4),
         named("classic", CLASSIC, 75.0, 340.0),
         named("Ceres' rule", CERES),
-        named("shipped policy, lambda alone", "learned-driver"),
-        Line("STBA + ours: agent trained on KITTI", runner.agent_trained_elsewhere("stba"), 16.0, 110.0),
-        Line("ours: agent trained on KITTI", runner.agent_trained_elsewhere(), 14.0, 100.2),
+        Line("STBA + ours, scale-free state and guard", runner.elsewhere(BEST, "stba"), 16.0, 110.0),
+        *ours(runner, 14.0, 100.2, elsewhere=True),
     ]
+    with_stba = "KITTI: ours takes a fifth of STBA's iterations"
     statements = [
-        Statement(ratio_claim, "KITTI: ours takes a fifth of classic's iterations", 14 / 75, ELSEWHERE, CLASSIC),
-        Statement(ratio_claim, "KITTI: ours takes a fifth of STBA's iterations", 0.2, f"stba+{ELSEWHERE}", "stba+stba"),
-        Statement(time_claim, "KITTI: ours takes a third of classic's time", 100.2 / 340.0, ELSEWHERE, CLASSIC),
+        Statement(ratio_claim, with_stba, 0.2, f"stba+{GUARDED}", "stba+stba"),
         Statement(success_claim, "KITTI: classic succeeds everywhere", 1.0, CLASSIC),
-        Statement(success_claim, "KITTI: ours succeeds everywhere", 1.0, ELSEWHERE),
     ]
+    for agent, what in ((TUNED, "tuned"), (GUARDED, "guarded")):
+        text = f"KITTI: ours ({what}) takes a"
+        statements += [
+            Statement(ratio_claim, f"{text} fifth of classic's iterations", 14 / 75, agent, CLASSIC),
+            Statement(time_claim, f"{text} third of classic's time", 100.2 / 340.0, agent, CLASSIC),
+            Statement(success_claim, f"KITTI: ours ({what}) succeeds everywhere", 1.0, agent),
+        ]
     return [Part(real_problems.find(runner.config.real.kitti), lines, statements, each=True)]
 
 
@@ -76,30 +82,32 @@ def _bal(runner: Runner) -> list[Part]:
     lines = [
         named("DeepLM's solver", "deeplm+ceres", 15.0, 40.75),
         named("Ceres, C++", CERES_ITSELF, 20.0, 46.7),
-        named("Ceres, C++, + shipped policy", CERES_WITH_OURS, 4.0, 20.75),
+        Line("Ceres, C++, + ours, scale-free state and guard", runner.elsewhere(BEST, CERES_ITSELF), 4.0, 20.75),
         named("classic", CLASSIC, 20.0, 110.0),
         named("Ceres' rule", CERES),
-        named("shipped policy, lambda alone", "learned-driver"),
-        Line("DeepLM's solver + ours: agent trained on BAL", runner.agent_trained_elsewhere("deeplm"), 5.0, 20.3),
-        Line("ours: agent trained on BAL", runner.agent_trained_elsewhere(), 4.0, 62.04),
+        Line("DeepLM's solver + ours, scale-free state and guard", runner.elsewhere(BEST, "deeplm"), 5.0, 20.3),
+        *ours(runner, 4.0, 62.04, elsewhere=True),
     ]
     over = lambda test, text, paper, ours, base: Statement(test, f"BAL: {text}", paper, ours, base)
-    with_deeplm = f"deeplm+{ELSEWHERE}"
+    with_ceres, with_deeplm = f"{CERES_ITSELF}+{GUARDED}", f"deeplm+{GUARDED}"
     statements = [
-        over(ratio_claim, "ours takes a fifth of classic's iterations", 0.2, ELSEWHERE, CLASSIC),
-        over(ratio_claim, "Ceres + ours takes a fifth of Ceres' iterations", 0.2, CERES_WITH_OURS, CERES_ITSELF),
+        over(ratio_claim, "Ceres + ours takes a fifth of Ceres' iterations", 0.2, with_ceres, CERES_ITSELF),
         over(ratio_claim, "DeepLM + ours takes a third of DeepLM's iterations", 1 / 3, with_deeplm, "deeplm+ceres"),
-        over(time_claim, "ours takes half of classic's time", 62.04 / 110.0, ELSEWHERE, CLASSIC),
-        over(time_claim, "Ceres + ours takes half of Ceres' time", 20.75 / 46.7, CERES_WITH_OURS, CERES_ITSELF),
-        over(success_claim, "ours succeeds everywhere", 1.0, ELSEWHERE, ""),
+        over(time_claim, "Ceres + ours takes half of Ceres' time", 20.75 / 46.7, with_ceres, CERES_ITSELF),
     ]
+    for agent, what in ((TUNED, "tuned"), (GUARDED, "guarded")):
+        statements += [
+            over(ratio_claim, f"ours ({what}) takes a fifth of classic's iterations", 0.2, agent, CLASSIC),
+            over(time_claim, f"ours ({what}) takes half of classic's time", 62.04 / 110.0, agent, CLASSIC),
+            over(success_claim, f"ours ({what}) succeeds everywhere", 1.0, agent, ""),
+        ]
     return [Part(real_problems.bal(runner.config.real), lines, statements, _same_error, each=True)]
 
 
 def _same_error(runner: Runner) -> Iterable[claims.Claim]:
     """The claim on the mean squared error of an observation, pixels squared, twice the final cost over their number:
     by how much it is larger with the agent, on each problem, the mean over the training runs."""
-    method, base = runner.agent_trained_elsewhere("deeplm"), method_named("deeplm+ceres")
+    method, base = runner.elsewhere(BEST, "deeplm"), method_named("deeplm+ceres")
     excess = []
     for source in real_problems.bal(runner.config.real).sources:
         before = runner.records_on([source], [base])
@@ -118,20 +126,23 @@ def _synthetic(runner: Runner) -> list[Part]:
     training"."""
     few = f"ours: trained on {runner.config.agents.trajectories} scenes only"
 
-    def part(problems: real_problems.Problems, ours: float, classic: float, other: str, own: float, alone: float):
+    def part(problems: real_problems.Problems, paper: float, classic: float, other: str, own: float, alone: float):
         name, method = {"stba": ("STBA", "stba+stba"), "deeplm": ("DeepLM", "deeplm+ceres")}[other]
+        driver = runner.agent(BEST, method=other)
         lines = [
             named("classic", CLASSIC, classic),
             named("Ceres' rule", CERES),
-            Line("ours: agent of this run", runner.agent(OURS), ours),
-            named("ours: shipped policy, wide synthetic scenes", "learned-driver", ours),
-            Line(few, runner.agent(FEW), ours),
+            Line(few, runner.agent(FEW), paper),
             named(name, method, alone),
-            Line(f"{name} + agent of this run", runner.agent(OURS, other), own),
+            Line(f"{name} + ours, scale-free state and guard", driver, own),
+            *ours(runner, paper),
         ]
-        text = "Synthetic training, {}: fraction of %s's iterations"
-        ratios = (OURS.name, CLASSIC, ours / classic), (f"{other}+{OURS.name}", method, own / alone)
-        stated = [Statement(ratio_claim, text % base, wanted, one, base) for one, base, wanted in ratios]
+        text = "Synthetic training, {}: fraction of %s's iterations (%s)"
+        stated = [
+            Statement(ratio_claim, text % (CLASSIC, "tuned"), paper / classic, OURS.name, CLASSIC),
+            Statement(ratio_claim, text % (CLASSIC, "guarded"), paper / classic, BEST.name, CLASSIC),
+            Statement(ratio_claim, text % (name, "guarded"), own / alone, driver.name, method),
+        ]
         return Part(problems, lines, stated)
 
     real = runner.config.real
@@ -169,12 +180,12 @@ def _families(runner: Runner) -> list[Part]:
         lines = [
             named("Ceres-CG", "pyceres:iterative"),
             named("DeepLM", "deeplm+ceres"),
-            Line("DeepLM + ours", runner.agent_trained_elsewhere("deeplm")),
-            Line("ours, explicit", runner.agent_trained_elsewhere()),
+            Line("DeepLM + ours, scale-free state and guard", runner.elsewhere(BEST, "deeplm")),
+            *ours(runner, elsewhere=True),
         ]
         paper = FAMILY_SECONDS.get(family.name)  # the paper has no numbers of other families
         if paper:
-            lines = [*(line._replace(paper_s=x) for line, x in zip(lines, paper, strict=False)), lines[-1]]
+            lines = [*(line._replace(paper_s=x) for line, x in zip(lines[:3], paper, strict=True)), *lines[3:]]
         stated = [
             Statement(
                 time_claim,
