@@ -24,7 +24,7 @@ import itertools
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -37,7 +37,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.cli.common import prepare_process
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.agent_config import AgentConfig, embedded
 from jaxba.damping.features import observe
 from jaxba.damping.guard import action_of
 from jaxba.damping.learned import AgentPolicy, ConstantAction
@@ -55,12 +55,6 @@ DECADES = (-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0)
 
 FREE = {"first_low": -9.0, "descent": 11.0}
 """Limits of the guard that leave lambda free: what is asked here is what it is worth, not what a limit costs."""
-
-PLAIN = {
-    **{"min_gain": 0.0, "refine_points": 0, "trials": 1, "camera_rounds": 0, "pattern_moves": 0, "previous_steps": 0},
-    **{"lens_step": "file", "point_starts": "step"},
-}
-"""An agent's step without embedded iterations, one trial each."""
 
 STATES = 12
 """States of an episode that are looked at."""
@@ -330,7 +324,7 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     """One row of the table."""
     began = time.perf_counter()
     say = lambda text: print(f"{time.perf_counter() - began:5.0f} s  {text}", flush=True)
-    agent = AgentConfig(**{**FREE, **(PLAIN if step == "plain" else {})})
+    agent = replace(AgentConfig() if step == "plain" else embedded(), **FREE)
     kind = SceneClass(10, 80, family="windows") if args.problems else SceneClass(10, 40)
     bank_config = BankConfig((kind,), (args.scenes,), problems=tuple(map(str, args.problems)))
     rules = GameConfig(agent, reward="constant", tolerance=1e-4)

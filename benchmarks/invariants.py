@@ -31,7 +31,7 @@ from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass, SceneFamily, Scenes, make_scenes
 from jaxba.game.scene_bank import info_of, initial_costs
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import lm_step, state_at
+from jaxba.lm.step import lm_step
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
@@ -102,7 +102,7 @@ def solve_all(
 
     def solve(scene: Scenes, cost: Array, info: ProblemInfo) -> Found:
         seen = with_scene(layout, scene.pixels, scene.mask)
-        start = state_at(scene.cameras, scene.points, cost, options)
+        start = LMState(scene.cameras, scene.points, cost)
         sign = jnp.sign(start.cameras[6])
 
         def body(number: Array, carry: tuple) -> tuple:

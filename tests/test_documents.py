@@ -22,7 +22,7 @@ from jaxba.solver.names import parse_solver
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
-MOST_WORDS = 15_150
+MOST_WORDS = 15_000
 """Of README and the pages written by hand; the table of claims of the paper has 1,850 more."""
 
 FENCE = re.compile(r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -18,8 +18,8 @@ import pytest
 import jaxba
 
 ORDER = (
-    *("typing", "runtime", "rotations", "problem", "structure", "model", "linear", "refinement", "lm", "damping"),
-    *("solver", "results", "io", "settings", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti", "game"),
+    *("typing", "runtime", "rotations", "problem", "io", "settings", "structure", "model", "linear", "refinement"),
+    *("lm", "damping", "solver", "results", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti", "game"),
     *("training", "peers", "bench", "paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""

@@ -14,17 +14,7 @@ from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.scene_bank import Bank, select, solve_scenes
 
 KIND = SceneClass(4, 12)
-AGENT = AgentConfig(
-    history=2,
-    low=-10.0,
-    high=2.0,
-    first_low=-10.0,
-    descent=50.0,
-    refine_points=0,
-    trials=1,
-    camera_rounds=0,
-    pattern_moves=0,
-)
+AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
 RULES = GameConfig(agent=AGENT, max_iterations=4)
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
-from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions, check_count
+from jaxba.problem.options import EMBEDDED, LensStep, Refinement, StepOptions
 
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
@@ -40,9 +40,8 @@ class AgentConfig:
     alternated between 10 and 1e-7 and ended 6% above the best cost of Ladybug-49. With a floor of 1e-6 instead, flat
     valleys of the held-out scenes were never crossed."""
 
-    min_gain: float = 0.25
-    """Gain ratio that a candidate must exceed; otherwise the step is shortened and tried again. Source: the sufficient
-    decrease of trust regions (Nocedal, Wright 2006, algorithm 4.1)."""
+    min_gain: float = 0.0
+    """Gain ratio that a candidate must exceed; 0 accepts any decrease."""
 
     guard: GuardMode = "hand-over"
     """`off`: the agent's lambdas are used as they are. `hand-over`: they are limited (`damping/guard.py`), and after
@@ -58,29 +57,14 @@ class AgentConfig:
     """Decades by which lambda rises at least after a rejection, and after an accepted step for each time that it was
     shortened. Without effect if it is 0 or the guard is off."""
 
-    refine_points: int = 3
-    """Embedded point iterations of the step, `Refinement.points`."""
-
-    trials: int = 4
-    """Trials of the step, `Refinement.trials`."""
-
-    camera_rounds: int = 3
-    """Camera rounds of the step, `Refinement.camera_rounds`."""
-
-    pattern_moves: int = 1
-    """Pattern moves of the step, `Refinement.pattern_moves`."""
+    refinement: Refinement = field(default_factory=Refinement)
+    """Embedded iterations of the step."""
 
     camera_damping: float = 1.0
     """Damping of the cameras relative to that of the points, `Coordinates.camera_damping`."""
 
-    lens_step: LensStep = "pixels"
+    lens_step: LensStep = "file"
     """How a step is added to focal length and distortion, `Coordinates.lens_step`."""
-
-    point_starts: PointStarts = "rays"
-    """Where embedded point iterations start, `Refinement.starts`."""
-
-    previous_steps: int = 3
-    """Earlier steps that are combined with the new one, if the method supports it, `Refinement.previous_steps`."""
 
     def __post_init__(self) -> None:
         for name, known in (("observation", Observation), ("guard", GuardMode)):
@@ -100,34 +84,19 @@ class AgentConfig:
             raise ValueError(f"descent must be positive, is {self.descent}")
         if not 0 <= self.escalate <= LARGEST_ESCALATION:
             raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")
-        check_count("refine_points", self.refine_points, 0)
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:
         """The options with this configuration's embedded iterations, damping of cameras and lens coordinates."""
         coordinates = replace(options.coordinates, camera_damping=self.camera_damping, lens_step=self.lens_step)
-        refinement = Refinement(
-            points=self.refine_points,
-            starts=self.point_starts,
-            trials=self.trials,
-            camera_rounds=self.camera_rounds,
-            pattern_moves=self.pattern_moves,
-            previous_steps=self.previous_steps,
-        )
-        return replace(options, refinement=refinement, coordinates=coordinates)
+        return replace(options, refinement=self.refinement, coordinates=coordinates)
 
 
-def config_from(values: dict[str, Any]) -> AgentConfig:
-    """The inverse of `dataclasses.asdict`.
+def embedded(points: int = EMBEDDED.points) -> AgentConfig:
+    """An agent whose step has all embedded iterations, and distortion stepped per pixel. Candidates without sufficient
+    decrease (Nocedal, Wright 2006, algorithm 4.1) are shortened and tried again.
 
-    Raises:
-        ValueError: unknown names or impossible values.
+    Args:
+        points: point iterations.
     """
-    known = {field.name: field for field in fields(AgentConfig)}
-    for name, value in values.items():
-        if name not in known:
-            raise ValueError(f"unknown setting {name!r}")
-        kind = type(known[name].default)
-        if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
-            raise ValueError(f"{name} must be of type {kind.__name__}, is {value!r}")
-    return AgentConfig(**values)
+    return AgentConfig(min_gain=0.25, refinement=replace(EMBEDDED, points=points), lens_step="pixels")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.agent_config import AgentConfig, embedded
 from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.lm.records import StepInfo
@@ -119,8 +119,8 @@ class Guarded:
     1e-9 was the best constant and 1e-8 cost 0.3% more (three seeds); on real problems 1e-8 was measured."""
 
     def step_options(self, base: StepOptions) -> StepOptions:
-        """The step of `AgentConfig`, with one point iteration."""
-        return AgentConfig(refine_points=1).step_options(base)
+        """All embedded iterations, with one point iteration."""
+        return embedded(points=1).step_options(base)
 
     def init(self, info: ProblemInfo) -> tuple[Rescue, Array]:
         """See `DampingPolicy`."""

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxba.damping.agent_config import config_from
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import Layer, LearnedPolicy
 from jaxba.runtime.atomic import atomic_write
+from jaxba.settings import read
 from jaxba.typing import InputError
 
 FORMAT = "jaxba-policy-1"
@@ -74,7 +75,7 @@ def load_policy(path: str | Path) -> LearnedPolicy:
         agent = json.loads(metadata["agent"])
         if agent.pop("effort", "fixed") != "fixed":  # a setting of earlier versions
             raise ValueError("its actions decide more than lambda")
-        config = config_from(agent)
+        config = read(AgentConfig, agent)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be used by this version: {error}") from None
     count = len(tensors) // 2

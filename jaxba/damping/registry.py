@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.agent_config import embedded
 from jaxba.damping.guarded import Guarded
 from jaxba.damping.learned import ConstantAction, boldest
 from jaxba.damping.policy import DampingPolicy
@@ -24,7 +24,7 @@ SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
 
 def bold() -> ConstantAction:
     """The smallest lambda that the guard of agents allows, in every iteration, and all embedded iterations."""
-    return boldest(AgentConfig())
+    return boldest(embedded())
 
 
 POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {

@@ -36,7 +36,7 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
-from jaxba.lm.step import lm_step, state_at
+from jaxba.lm.step import lm_step
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
@@ -190,7 +190,7 @@ class Game:
         """The episode of one scene before its first iteration."""
         scenes, initial, info = jax.tree.map(lambda x: x[scene], (bank.scenes, bank.initial_cost, bank.info))
         info = info._replace(max_iterations=jnp.asarray(self.config.max_iterations, jnp.int32))
-        state = state_at(scenes.cameras, scenes.points, initial, self.options)
+        state = LMState(scenes.cameras, scenes.points, initial)
         return Episode(scene, state, begin(self.config.agent, info))
 
     def iterate(

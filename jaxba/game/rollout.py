@@ -19,8 +19,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import StepInfo
-from jaxba.lm.step import state_at
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
@@ -82,7 +81,7 @@ def _play(
     def fresh(scene: Int[Array, ""]) -> tuple[Array, Carry]:
         at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)  # idle lanes repeat the last
         start = at(bank.scenes)
-        state = state_at(start.cameras, start.points, at(bank.initial_cost), options)
+        state = LMState(start.cameras, start.points, at(bank.initial_cost))
         return scene, begin(at(bank.info), policy, state)
 
     def advance(scene: Array, carry: Carry) -> tuple[Carry, StepInfo]:

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -97,7 +97,6 @@ class DampedSystem(NamedTuple):
     coordinates: RotationCoordinates  # in which the damping is diagonal
     forcing: float | Float[Array, ""] = 0.0  # where conjugate gradients stop, if they are used
     iteration: int | Int[Array, ""] = 0  # from 0
-    state: Any = ()  # of the method (`lm.method.StepMethod.begin`)
 
     @classmethod
     def of(

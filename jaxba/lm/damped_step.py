@@ -20,8 +20,6 @@ Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
@@ -44,7 +42,6 @@ def solve_step(
     damping: Float[Array, ""],
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
-    method_state: Any = (),
 ) -> Step:
     """Solves `(H + D) d = -g` for cameras and points.
 
@@ -56,14 +53,13 @@ def solve_step(
         damping: lambda, dimensionless for diagonal scaling.
         options: linear solver or method, scaling and coordinates.
         iteration: number of the iteration; selects the random clusters of methods that use them.
-        method_state: state of the method (`StepMethod.begin`).
 
     Returns:
         The step. It is non-finite if a factorisation failed; the caller rejects such a step.
     """
     forcing = (options.truncated or options.conjugate_gradients).forcing
     system = DampedSystem.of(layout, linear, cameras, points, damping, options)
-    system = system._replace(forcing=forcing, iteration=iteration, state=method_state)
+    system = system._replace(forcing=forcing, iteration=iteration)
     solution = method_of(options).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
     point_step = solution.points
@@ -96,8 +92,8 @@ def _slope_and_damping(
 
         m(0) - m(d) = -g.d - d.H d / 2 = (d.D d - g.d + d.e) / 2.
 
-    `d.e` is zero for a factorisation, for conjugate gradients started at zero, and for the best step of a subspace. The
-    two terms that are left are positive.
+    `d.e` is zero for a factorisation, and for conjugate gradients started at zero. The two terms that are left are
+    positive.
     """
     points, cameras = system.points, system.cameras
     of_points = jnp.sum(jnp.stack(points.gradient) * point_step), jnp.sum(jnp.stack(points.damping) * point_step**2)

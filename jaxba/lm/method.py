@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 from jax import Array
 from jaxtyping import Float, Int
@@ -45,14 +45,6 @@ class StepMethod(MethodTraits, ABC):
             system: the damped system.
             options: static options of the step.
         """
-
-    def begin(self, cameras: Float[Array, "parameters cameras"], options: StepOptions) -> Any:
-        """State of the method before the first iteration, a pytree; empty for a method without one."""
-        return ()
-
-    def advance(self, state: Any, change: Float[Array, "parameters cameras"], options: StepOptions) -> Any:
-        """State of the method after an accepted change of the cameras; a rejected one leaves it as it is."""
-        return state
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,6 @@ class LMState(NamedTuple):
     cost: Float[Array, ""]
     """Pixels^2."""
 
-    method_state: Any = ()
-    """State of the method (`lm.method.StepMethod`), a pytree."""
-
 
 class StepInfo(NamedTuple):
     """Record of one iteration. A damping policy sees this and nothing else of the solve.

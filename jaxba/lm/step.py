@@ -24,7 +24,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.damped_step import solve_step
-from jaxba.lm.method import check_plain, method_of
+from jaxba.lm.method import check_plain
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.model.linearize import Reference, cost, is_weightless, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem
@@ -74,17 +74,7 @@ def state_of(
     parameters = jnp.asarray(cameras, dtype).T
     # padding points have an index out of range and are placed at the origin
     positions = jnp.asarray(points, dtype).at[layout.points].get(mode="fill", fill_value=0).T
-    return state_at(parameters, positions, cost(layout, parameters, positions, options.loss), options)
-
-
-def state_at(
-    cameras: Float[Array, "parameters cameras"],
-    points: Float[Array, "3 points"],
-    cost: Float[Array, ""],
-    options: StepOptions,
-) -> LMState:
-    """The state before the first iteration."""
-    return LMState(cameras, points, cost, method_of(options).begin(cameras, options))
+    return LMState(parameters, positions, cost(layout, parameters, positions, options.loss))
 
 
 @for_traces
@@ -134,7 +124,7 @@ def propose(
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = only_free(layout, linear, options.intrinsics)
-    step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration, state.method_state)
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration)
     return Proposal(step, linear.reference, is_weightless(layout, linear, state.cost, options.loss))
 
 
@@ -147,7 +137,7 @@ def try_step(
     min_gain: float | Float[Array, ""] = 0.0,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain)
+    against = comparison(layout, *state, proposal.reference, proposal.step, options, min_gain)
     return take_step(layout, state, damping, proposal, best_candidate(against), options)
 
 
@@ -161,9 +151,8 @@ def take_step(
 ) -> tuple[LMState, StepInfo]:
     """End of `try_step`: the state after the accept decision on a candidate, and the record. Arguments as there."""
     step = proposal.step
-    advanced = method_of(options).advance(state.method_state, candidate.cameras - state.cameras, options)
     choose = lambda new, old: jnp.where(candidate.accepted, new, old)
-    after = jax.tree.map(choose, LMState(*candidate[:3], advanced), state)
+    after = jax.tree.map(choose, LMState(*candidate[:3]), state)
     tried = candidate.step_fraction * step.cameras, candidate.points - state.points
     moved, size = sum_over_devices(layout, (jnp.sum(tried[1] ** 2), jnp.sum(state.points**2)))
     return after, StepInfo(

@@ -20,8 +20,7 @@ from jaxtyping import Float, Int
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.schur import CameraSystem, DampedSystem, PointSystem, jacobian_product
-from jaxba.lm.method import MethodStep
-from jaxba.methods.subspace import SubspaceMethod, best_in_span
+from jaxba.lm.method import MethodStep, StepMethod
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.structure.layout import Layout
@@ -29,7 +28,7 @@ from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
 
 @dataclass(frozen=True)
-class GlobalConjugateGradients(SubspaceMethod):
+class GlobalConjugateGradients(StepMethod):
     """The method `deeplm`."""
 
     conjugate_gradients: ConjugateGradients = field(
@@ -43,8 +42,6 @@ class GlobalConjugateGradients(SubspaceMethod):
         """See `StepMethod`."""
         rule = self.conjugate_gradients
         step, points, iterations = solve_normal(*system[:4], rule, system.forcing)
-        if options.kept_steps:
-            step, points = best_in_span(system, step), None  # the point step follows by back-substitution
         return MethodStep(step, points, iterations, True)
 
 

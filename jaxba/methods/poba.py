@@ -20,14 +20,13 @@ from jaxtyping import Float
 
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced
-from jaxba.lm.method import MethodStep
-from jaxba.methods.subspace import SubspaceMethod, best_in_span
+from jaxba.lm.method import MethodStep, StepMethod
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.runtime import loops
 
 
 @dataclass(frozen=True)
-class PowerSeries(SubspaceMethod):
+class PowerSeries(StepMethod):
     """The method `poba`."""
 
     order: int = 20
@@ -43,9 +42,7 @@ class PowerSeries(SubspaceMethod):
         product = lambda x: apply_reduced(system, x)
         inverse = block_inverse(system.cameras.blocks)
         step = series(product, system.cameras, inverse, system.cameras.right, self.order)
-        improved = options.kept_steps > 0
-        step = best_in_span(system, step) if improved else step
-        return MethodStep(step, None, jnp.asarray(self.order, jnp.int32), improved)
+        return MethodStep(step, None, jnp.asarray(self.order, jnp.int32), residual_orthogonal=False)
 
 
 def series(

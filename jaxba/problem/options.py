@@ -81,18 +81,8 @@ class Refinement:
     """Most repetitions of an accepted step in its direction, each twice as far, if the linear model did not predict its
     decrease or damping limited its length."""
 
-    previous_steps: int = 0
-    """Number of previous camera steps that, with an inexact step, span the subspace in which the step is optimised; for
-    methods with `MethodTraits.uses_previous_steps`."""
-
     def __post_init__(self) -> None:
-        for name, least in (
-            ("points", 0),
-            ("camera_rounds", 0),
-            ("pattern_moves", 0),
-            ("previous_steps", 0),
-            ("trials", 1),
-        ):
+        for name, least in (("points", 0), ("camera_rounds", 0), ("pattern_moves", 0), ("trials", 1)):
             check_count(name, getattr(self, name), least)
         _check_known("starts", self.starts, PointStarts)
 
@@ -138,9 +128,6 @@ class MethodTraits:
 
     conjugate_gradients: ConjugateGradients | None = None
     """Stopping rule if it solves by truncated conjugate gradients, else None."""
-
-    uses_previous_steps: bool = False
-    """Whether it can use previous camera steps (`Refinement.previous_steps`)."""
 
 
 @dataclass(frozen=True)
@@ -208,11 +195,6 @@ class StepOptions:
         return None if self.linear_solver == "explicit" else self.conjugate_gradients
 
     @property
-    def kept_steps(self) -> int:
-        """Number of previous camera steps that are kept for the next step."""
-        return self.refinement.previous_steps if self.method and self.method.uses_previous_steps else 0
-
-    @property
     def uses_camera_clusters(self) -> bool:
         """Whether the layout needs camera clusters, for the two-level preconditioner."""
         exact = self.method or self.linear_solver == "explicit"
@@ -235,3 +217,7 @@ def check_count(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name} must be at least {least}, is {value}")
     if count > LARGEST_COUNT:
         raise ValueError(f"{name} must be at most {LARGEST_COUNT}, is {value}")
+
+
+EMBEDDED = Refinement(points=3, starts="rays", trials=4, camera_rounds=3, pattern_moves=1)
+"""All embedded iterations, `+embedded` in a solver's name."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, cast, get_args
 
 from jaxba.damping import DampingPolicy, brings_step, make_policy
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.agent_config import embedded
 from jaxba.damping.policy import trained_step
 from jaxba.damping.registry import SUFFIX
-from jaxba.problem.options import Refinement, StepOptions
+from jaxba.problem.options import EMBEDDED, Refinement, StepOptions
 from jaxba.solver.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.typing import InputError
@@ -75,7 +75,7 @@ class SolverName:
         if self.refine_points is not None:
             step = replace(step, refinement=Refinement(points=self.refine_points))
         elif not brings_step(self.policy):
-            step = AgentConfig().step_options(StepOptions())
+            step = embedded().step_options(StepOptions())
         return policy, SolveOptions(
             method=self.method, refinement=step.refinement, coordinates=step.coordinates, dtype=self.dtype
         )
@@ -91,7 +91,7 @@ def adjusted(
     """
     if repairs is not None:
         points = 0 if options.refinement is None else options.refinement.points
-        whole = AgentConfig(refine_points=points).step_options(StepOptions()).refinement
+        whole = replace(EMBEDDED, points=points)
         found = {"none": Refinement(points=points), "trials": replace(whole, camera_rounds=0, pattern_moves=0)}
         options = replace(options, refinement=found.get(repairs, whole))
     if min_gain is not None:

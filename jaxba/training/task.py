@@ -219,9 +219,7 @@ def baseline_policies(
     plain = config.step_options
     coordinates = replace(options.coordinates, camera_damping=plain.coordinates.camera_damping)
     embedded = replace(options, coordinates=coordinates)
-    # where points start and which previous steps take part are no embedded iterations
-    start, previous = plain.refinement.starts, plain.refinement.previous_steps
-    has_embedded = replace(embedded.refinement, starts=start, previous_steps=previous) != plain.refinement
+    has_embedded = embedded.refinement != plain.refinement
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     found: dict[str, tuple[DampingPolicy, StepOptions]] = {}
     for name in (*own, *names):

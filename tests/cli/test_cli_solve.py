@@ -56,7 +56,7 @@ def test_a_file_of_settings_stands_in_for_what_the_command_line_leaves_out(tiny,
     args = with_settings(str(path), [str(tiny), "--refine-points", "3"])
     policy, options = solve_options(args)
     assert (policy.initial, policy.min_gain) == (1e-5, 1e-2)
-    rays = Refinement(points=3, starts="rays", trials=4, previous_steps=3)
+    rays = Refinement(points=3, starts="rays", trials=4)
     assert options.refinement == rays
     assert run([str(tiny), "--settings", str(path), "--output", str(path)]) == 2
     assert solve_options(replace(args, repairs="none"))[1].refinement == Refinement(points=3)

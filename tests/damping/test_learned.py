@@ -21,7 +21,7 @@ from support import same_bits, solve
 import jaxba
 from jaxba import SolveOptions, StepOptions, make_policy, random_scene, scene_like, solve_loop
 from jaxba.damping import registry
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.agent_config import AgentConfig, embedded
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import Layer, LearnedPolicy, learned_from
 from jaxba.damping.policy_file import FORMAT, LARGEST_FILE, load_policy, save_policy
@@ -55,7 +55,9 @@ def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread
 @given(st.integers(0, 99), st.sampled_from(["scale-free", "paper", "duration"]), st.integers(1, 20))
 def test_a_policy_comes_back_from_its_file_bit_by_bit(tmp_path_factory, seed, observation, history):
     path = tmp_path_factory.mktemp("policy") / "some.safetensors"
-    policy = random_policy(seed, AgentConfig(observation=observation, history=history, guard="off", trials=2))
+    policy = random_policy(
+        seed, AgentConfig(observation=observation, history=history, guard="off", refinement=Refinement(trials=2))
+    )
     save_policy(path, policy, {"seed": str(seed)})
     found = load_policy(path)
     assert found.config == policy.config
@@ -234,7 +236,7 @@ def _keys(tree):
 def shipped(tmp_path, monkeypatch):
     """A policy with embedded iterations in the place of the shipped one, whose own file is not looked at."""
     file = tmp_path / "shipped.safetensors"
-    save_policy(file, random_policy(0, replace(AGENT, refine_points=2, trials=3)))
+    save_policy(file, random_policy(0, replace(AGENT, refinement=Refinement(2, trials=3))))
     monkeypatch.setattr(registry, "SHIPPED", file)
     return file
 
@@ -280,9 +282,8 @@ def test_the_path_of_a_policy_is_a_name(tmp_path, folder):
 def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned").build()
     chex.assert_trees_all_equal(policy.layers, load_policy(shipped).layers, strict=True)
-    coordinates = Coordinates(lens_step="pixels")
-    embedded = Refinement(2, "rays", trials=3, camera_rounds=AGENT.camera_rounds, pattern_moves=1, previous_steps=3)
-    assert options == SolveOptions(refinement=embedded, coordinates=coordinates)
+    coordinates = Coordinates()
+    assert options == SolveOptions(refinement=Refinement(2, trials=3), coordinates=coordinates)
     policy, options = parse_solver("learned+refine0").build()
     chex.assert_trees_all_equal(policy.layers, load_policy(shipped).layers, strict=True)
     assert options == SolveOptions(refinement=Refinement(), coordinates=coordinates)
@@ -290,7 +291,7 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     options = parse_solver("ceres+refine3").build()[1]
     assert options == SolveOptions(refinement=Refinement(points=3), coordinates=Coordinates())
     policy, options = parse_solver("ceres+embedded").build()
-    assert options.step_options(policy) == AgentConfig().step_options(StepOptions())
+    assert options.step_options(policy) == embedded().step_options(StepOptions())
 
 
 def test_the_shipped_policy_is_wired_as_the_preset_of_its_files_name():

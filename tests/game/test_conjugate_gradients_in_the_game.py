@@ -11,7 +11,8 @@ import numpy as np
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.scene_bank import initial_costs
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import propose, state_at
+from jaxba.lm.records import LMState
+from jaxba.lm.step import propose
 from jaxba.training.config import load
 
 SCENES = 64
@@ -27,7 +28,7 @@ def test_a_vmapped_step_of_the_papers_scenes_is_that_of_dense_algebra():
     def steps(options, damping):
         def one(scene: Scenes, cost):
             layout = with_scene(class_layout(kind, options), scene.pixels, scene.mask)
-            state = state_at(scene.cameras, scene.points, cost, options)
+            state = LMState(scene.cameras, scene.points, cost)
             return propose(layout, state, damping, options).step
 
         return jax.vmap(one)(scenes, costs)

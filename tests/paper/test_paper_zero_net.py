@@ -26,11 +26,6 @@ AGENT = AgentConfig(
     high=2.0,
     guard="off",
     escalate=0.0,
-    min_gain=0.0,
-    refine_points=0,
-    trials=1,
-    camera_rounds=0,
-    pattern_moves=0,
 )
 SMALL = ZeroNetConfig(width=8, layers=2, batch=8, updates=30, max_iterations=10, learning_rate=0.03)
 

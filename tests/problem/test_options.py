@@ -69,5 +69,4 @@ def test_the_defaults_are_those_of_ceres():
 
 
 def test_the_default_is_a_plain_step():
-    assert Refinement() == Refinement(points=0, trials=1, camera_rounds=0, pattern_moves=0, previous_steps=0)
-    assert StepOptions().kept_steps == 0
+    assert Refinement() == Refinement(points=0, trials=1, camera_rounds=0, pattern_moves=0)

@@ -97,8 +97,8 @@ def test_a_base_is_a_name_or_a_path_relative_to_the_file(tmp_path, monkeypatch):
 
 
 def test_what_is_read_is_the_readers_own():
-    read("train", "default")["game"]["agent"]["trials"] = 7
-    assert read("train", "default")["game"]["agent"]["trials"] == 1
+    read("train", "paper")["game"]["agent"]["history"] = 7
+    assert read("train", "paper")["game"]["agent"]["history"] == 5
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from jaxba import settings
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.settings import configurations
 from jaxba.training.config import SettingsError, TrainConfig, load
 from jaxba.training.sac import SacConfig
@@ -49,9 +49,9 @@ def test_the_default_is_for_lambda_alone_on_plain_steps():
 
 
 def test_a_file_may_extend_a_preset_and_overrides_win_over_both(tmp_path):
-    path = written(tmp_path, "extends: default\nseed: 3\ngame: {agent: {trials: 2}}\n")
+    path = written(tmp_path, "extends: default\nseed: 3\ngame: {agent: {refinement: {trials: 2}}}\n")
     found = load(path, ["seed=4"])
-    assert found == load("default", ["seed=4", "game.agent.trials=2"])
+    assert found == load("default", ["seed=4", "game.agent.refinement.trials=2"])
 
 
 def test_the_preset_of_the_paper_is_the_papers_setting():
@@ -70,7 +70,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     )
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)
     agent = found.game.agent
-    assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)
+    assert (agent.observation, agent.guard, agent.refinement) == ("paper", "off", Refinement())
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
     assert found.step_options.linear_solver == "cg"

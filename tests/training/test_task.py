@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from jaxba import make_policy
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.agent_config import embedded
 from jaxba.damping.learned import boldest
 from jaxba.training.config import load
 from jaxba.training.task import BASELINES, CONSTANT, baseline_policies
 
-EMBEDDED = tuple(
-    f"game.agent.{field.name}={field.default}"
-    for field in fields(AgentConfig)
-    if field.name not in ("observation", "guard", "min_gain")
+EMBEDDED = (
+    *(f"game.agent.refinement.{name}={value}" for name, value in asdict(embedded().refinement).items()),
+    "game.agent.lens_step=pixels",
 )
-"""An agent whose step has embedded iterations, as those of `AgentConfig`."""
+"""An agent whose step has embedded iterations."""
 
 NAMES = tuple(name for name in BASELINES if name != CONSTANT)
 
