@@ -35,7 +35,7 @@ def place(tmp_path, monkeypatch) -> Path:
     for name in ("g.yaml", "own.yaml"):
         Path(name).write_text("gauge: two-cameras\n" if name == "g.yaml" else "")
     Path("run").mkdir()
-    Path("run/config.yaml").write_text("extends: fast\n")
+    Path("run/config.yaml").write_text("extends: default\n")
     Path("run/settings.json").write_text("problems: [scene:tiny:1]\n")
     Path("kitti/image_0").mkdir(parents=True)
     for number in range(3):

@@ -89,11 +89,11 @@ def call(x, power=1):
 @pytest.mark.parametrize(
     "how",
     [
-        {"policy": "bold", "compilation": "auto"},
+        {"policy": "ceres+embedded", "compilation": "auto"},
         {"policy": "ceres", "dtype": "mixed"},
-        {"policy": "bold", "method": "stba"},
+        {"policy": "ceres+embedded", "method": "stba"},
         {"policy": "ceres", "linear_solver": "implicit"},
-        {"policy": "bold", "pad": True},
+        {"policy": "ceres+embedded", "pad": True},
     ],
     ids=str,
 )
