@@ -24,7 +24,6 @@ except ModuleNotFoundError:
     sys.exit("this example needs sbx, which is no part of jaxba: pip install sbx-rl")
 
 from jaxba import StepOptions
-from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.env import GameConfig, make_game
 from jaxba.game.gym import GymVectorGame
 from jaxba.game.random_scenes import SceneClass
@@ -99,7 +98,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     kind = SceneClass(5, 20)
-    config = GameConfig(agent=AgentConfig(trials=1, camera_rounds=0, pattern_moves=0))
+    config = GameConfig()
     options = config.agent.step_options(StepOptions())
     print("making scenes", flush=True)
     bank = BankConfig(classes=(kind,), scenes=(arguments.scenes,))
