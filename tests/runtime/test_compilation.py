@@ -56,12 +56,8 @@ def test_this_jaxlib_compiles_at_the_lower_level():
     "how",
     [
         {"policy": "ceres"},
-        {"policy": "bold"},
         {"policy": "bold", "method": "stba"},
-        {"policy": "bold", "method": "deeplm"},
-        {"policy": "bold", "linear_solver": "sparse"},
         {"policy": "bold", "linear_solver": "implicit"},
-        {"policy": "ceres", "method": "poba"},
         {"policy": "bold", "pad": True},
     ],
     ids=str,
@@ -73,7 +69,7 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
     assert quick.quick_iterations == (quick.iterations if compiler_options("quick") else 0)
     assert (quick.iterations, quick.accepted, quick.termination) == (full.iterations, full.accepted, full.termination)
     np.testing.assert_allclose(quick.history.cost, full.history.cost, rtol=1e-8)
-    # a network of, among others, the last digits of a decrease
+    # Ceres' rule sees the last digits of a decrease
     np.testing.assert_allclose(quick.history.damping, full.history.damping, rtol=1e-4)
 
 
