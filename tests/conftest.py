@@ -113,14 +113,14 @@ def _machine() -> str:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_programs():
-    """Many modules compile more programs than one process may map. Inside a module they stay, as far as they may, so
-    that its tests can count them."""
+    """Many modules compile more programs than one process may map, or a small machine holds. Inside a module they stay,
+    as far as they may, so that its tests can count them."""
     from jaxba.runtime import process  # here, so that the import hook of jaxtyping sees it
 
     share, process.MAPPINGS_SHARE = process.MAPPINGS_SHARE, 0.8
     yield
     process.MAPPINGS_SHARE = share
-    process.release_programs()
+    process.release_programs(0.2)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -79,7 +79,7 @@ REDUCTION = replace(OURS, name="agent-reduction", overrides=("game.reward=reduct
 CLOCK = replace(OURS, name="agent-clock", overrides=BY_THE_CLOCK)
 REVERSED = replace(OURS, name="agent-reversed", overrides=("game.reward=reversed", "game.agent.observation=duration"))
 
-WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[400]", "bank.refine_points=3")
+WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[200]", "bank.refine_points=3")
 """Windows of an agent that is trained on real problems. Ten points, as in the synthetic scenes, would leave most
 cameras of a window with too few observations."""
 
