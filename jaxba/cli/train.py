@@ -155,7 +155,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
             outcome = driver.train(config, work.game, work.evaluate, folder, hooks, devices)
             interrupt.graceful = False
         except KeyboardInterrupt:
-            console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
+            console.print(f"interrupted; go on with {_again(folder)}")
             return common.INTERRUPTED
         except OSError as error:
             raise common.UsageError(

@@ -15,8 +15,11 @@ from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 from jaxba.typing import InputError
 
-LEARNED, BOLD, GUARDED = "learned", "bold", "guarded"
-"""The shipped network, for lambda alone; the guard of agents without a network; the default policy of a solve."""
+LEARNED, BOLD = "learned", "bold"
+"""The shipped network, for lambda alone, and the guard of agents without a network."""
+
+GUARDED = "guarded"
+"""The default policy of a solve."""
 
 SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
 """File of `learned`, trained with the preset of `jaxba-train` that has its name."""

@@ -35,7 +35,7 @@ from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.records import KINDS, LMState, StepInfo
 from jaxba.lm.step import lm_step
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.numerics import check_x64, for_traces
@@ -85,12 +85,27 @@ class GameConfig:
     def __post_init__(self) -> None:
         if not callable(self.reward) and self.reward not in get_args(Reward):
             raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, not {self.reward!r}")
+        if callable(self.reward):
+            _check_reward(self.reward)
         if not (self.max_iterations >= 1 and self.tolerance > 0 and self.scale > 0):
             raise ValueError("max_iterations, tolerance and scale must be positive")
         if not self.tolerance < 1:
             raise ValueError(f"tolerance must be below 1, is {self.tolerance}: starts would be successes")
         if not self.bonus >= 0:
             raise ValueError(f"bonus must not be negative, is {self.bonus}")
+
+
+def _check_reward(reward: RewardFunction) -> None:
+    """Traces a user's reward. Raises ValueError: it cannot be traced, or returns anything but one number."""
+    scalar = lambda kind: jax.ShapeDtypeStruct((), kind)
+    step = StepInfo(*[scalar(KINDS.get(name, jnp.float32)) for name in StepInfo._fields])
+    try:
+        found = jax.eval_shape(lambda *of: jnp.asarray(reward(*of)), step, scalar(jnp.float32), scalar(bool))
+    except Exception as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"the reward is no function of (step, best, success) that JAX can trace: {reason}") from error
+    if found.shape:
+        raise ValueError(f"the reward must be one number, not an array of shape {found.shape}")
 
 
 class Episode(NamedTuple):
@@ -206,8 +221,10 @@ class Game:
 
     @for_traces
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
-        """Plays one action everywhere."""
+        """Plays one action everywhere. Raises ValueError: actions of another shape."""
         check_x64(self.banks[0].initial_cost.dtype)
+        if (expected := (self.num_envs, self.action_size)) != (shape := jnp.shape(action)):
+            raise ValueError(f"actions must have shape {expected}, not {shape}")
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):

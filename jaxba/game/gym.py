@@ -144,7 +144,9 @@ class GymGame(gymnasium.Env):
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("call reset before step: no episode is under way")
-        observation, reward, (terminated,), (truncated,), infos = self._one.step(np.asarray(action)[None])
+        observation, reward, (terminated,), (truncated,), infos = self._one.step(
+            _actions(action, self.action_space.shape)[None]
+        )
         self._running = not (terminated or truncated)
         if not self._running:
             observation = infos["final_obs"]

@@ -114,7 +114,7 @@ def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
     scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
     rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
     if not len(rows):
-        raise ValueError(f"no scene of {kind.cameras} cameras and {kind.points} points is worth solving")
+        raise ValueError(f"no scene of {_shape(kind)} is worth solving")
     return scene_problem(kind, scenes, int(rows[0]))
 
 
@@ -176,10 +176,15 @@ def solve_scenes(
         rules: the portfolio.
         on_rule: called with the name of a rule when it begins.
         tolerance: to which the first rule's iterations are counted.
+
+    Raises:
+        InputError: none of the scenes is worth solving.
     """
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
     keep = worth_solving(kind, info)
+    if not len(keep):
+        raise InputError(f"none of {len(info.cost)} scenes of {_shape(kind)} is worth solving: draw more")
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
@@ -194,6 +199,10 @@ def solve_scenes(
     floor = SMALLEST_COST * np.asarray(info.observations)
     usable = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
     return bank, usable
+
+
+def _shape(kind: SceneClass) -> str:
+    return f"{kind.cameras} cameras x {kind.points} points"
 
 
 class Split(NamedTuple):
@@ -229,7 +238,7 @@ def make_banks(
     """
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
-        where = f"{kind.cameras} cameras x {kind.points} points"
+        where = _shape(kind)
         on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
         class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
         solved = lambda scenes, on_rule=on_rule, kind=kind: solve_scenes(

@@ -60,12 +60,14 @@ def make_env(
         problems: scenes of your own instead of random ones: windows of neighbouring cameras are cut from these
             problems, in memory or files, and the last fifth of every problem is held out.
         reward: instead of the preset's: a name, or a function of the iteration (`StepInfo`), the best known cost of
-            the scene and whether the episode has ended in success, which returns a number.
+            the scene and whether the episode has ended in success. It is traced, returns one number, and gets neither
+            scale nor bonus.
         report: called with a line of text when something begins that takes a while.
 
     Raises:
         SettingsError: no such preset, or an impossible setting.
         InputError: no scene would be left to train on, or the problems are no source of windows.
+        ValueError: the reward is no such function.
     """
     config = load(preset, overrides)
     if problems:
@@ -107,7 +109,7 @@ def train(
 
     Raises:
         ValueError: an impossible number.
-        TrainError: the losses are not finite any more, or the folder holds another run.
+        TrainError: losses or all transitions are not finite, or the folder holds another run.
     """
     if steps < 1:
         raise ValueError(f"steps must be at least 1, not {steps}")
@@ -121,7 +123,9 @@ def train(
     show = lambda rows: print(_line(rows, chunks), flush=True)
     hooks = driver.Hooks(rows=show) if verbose else driver.Hooks()
     with tempfile.TemporaryDirectory() as temporary, numerics(config.bank.dtype), process.single_blas_thread():
-        outcome = driver.train(config, env, work.evaluate, Path(folder or temporary), hooks)
+        place = Path(folder or temporary)
+        place.mkdir(parents=True, exist_ok=True)
+        outcome = driver.train(config, env, work.evaluate, place, hooks)
     return work.policy(driver.best_of(outcome.best).actor)
 
 

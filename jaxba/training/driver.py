@@ -151,7 +151,7 @@ def train(
         devices: the same in all processes; JAX's default device if None.
 
     Raises:
-        TrainError: the losses are not finite any more, no checkpoint can be used or written, or the agents and
+        TrainError: losses or all transitions are not finite, no checkpoint can be used or written, or the agents and
             environments cannot be divided among the devices.
         MainFailedError: the first process has failed, and this is another.
     """
@@ -292,6 +292,10 @@ class _Run:
         if len(bad):
             raise TrainError(f"chunk {self.chunk} of agent {bad[0] + 1}: the losses are not finite any more")
         counts = [distributed.to_host(x) for x in (self.state.env_steps, self.state.updates)]
+        if np.any(means["dropped"] >= counts[0] - before[0]):
+            raise TrainError(
+                f"chunk {self.chunk}: all transitions hold numbers that are not finite; look at the reward"
+            )
         steps, updates = (float(np.sum(new - old)) / seconds for new, old in zip(counts, before, strict=True))
         clocks = {"wall_s": self.wall_s, "chunk_s": seconds, "steps_per_s": steps, "updates_per_s": updates}
         clocks |= {"cpu_per_wall": cpu / seconds}

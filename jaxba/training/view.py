@@ -49,7 +49,7 @@ def lines(
         text += f", p90 {_mean(rows, 'held_out/p90'):.0f}, failures {100 * _mean(rows, 'held_out/failures'):.1f} %"
         shown = [f"{name} {rules[name].mean:.2f}" for name in YARDSTICKS if name in rules]
         text += f" ({', '.join(shown)})" if shown else ""
-        found.append(f"{start}{text}{', best so far' if best else ''}")
+        found.append(f"{start}{text}{', best on training scenes so far' if best else ''}")
         found += _warning(rows, decades)
     return found
 

@@ -197,7 +197,7 @@ def test_an_interrupted_run_continues_with_the_same_results(folder, finished, ca
     with monkeypatch.context() as patch:
         interrupt_at(3, patch, times=2)
         assert run(["--out", str(folder), "--resume"]) == 130
-    assert "go on from the last checkpoint" in capsys.readouterr().out
+    assert "interrupted; go on with" in capsys.readouterr().out
     assert run(["--out", str(folder), "--resume"]) == 0
     plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
     assert list(map(plain, log.read(folder))) == list(map(plain, log.read(finished)))

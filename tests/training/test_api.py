@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,8 @@ import jaxba
 from jaxba.game import scene_bank
 from jaxba.game.rollout import play
 from jaxba.game.windows import read_windows
+from jaxba.training.checkpoint import TrainError
+from jaxba.typing import InputError
 
 SMALL = (
     *("bank.classes=[{cameras: 5, points: 12}]", "bank.scenes=[80]", "envs=[4]", "game.max_iterations=6"),
@@ -51,6 +55,46 @@ def test_a_reward_of_ones_own_is_the_reward(env):
     distance = 10 ** (6 * np.asarray(step.final_observation)[:, -1].astype(float))
     np.testing.assert_allclose(step.reward[~reached], 1 + distance[~reached], rtol=1e-4)
     np.testing.assert_array_equal(np.asarray(step.reward)[reached], 100)
+
+
+@pytest.mark.parametrize(
+    ("reward", "words"),
+    [
+        (lambda step, best, success: 1.0 if success else 0.0, "can trace: .*bool"),
+        (lambda step, best: 1.0, "can trace: .*positional arguments"),
+        (lambda step, best, success: None, "can trace: "),
+        (lambda step, best, success: jnp.stack([step.cost, best]), r"one number, not an array of shape \(2,\)"),
+        ("gain", "must be one of duration"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_reward_is_refused_in_one_line_before_scenes_are_made(reward, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        jaxba.make_env("paper", *SMALL, reward=reward)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_actions_of_another_shape_are_refused(env):
+    with jax.enable_x64(True):
+        state, _ = env.reset(jax.random.key(0))
+        for shape in ((4,), (3, 1), (4, 2), ()):
+            with pytest.raises(ValueError, match=r"actions must have shape \(4, 1\), not"):
+                jax.eval_shape(lambda state, action: env.step(state, action), state, jnp.zeros(shape))
+
+
+def test_no_scene_worth_solving_is_said(monkeypatch):
+    monkeypatch.setattr(scene_bank, "worth_solving", lambda kind, info: np.zeros(0, int))
+    with pytest.raises(InputError, match="none of 80 scenes of 5 cameras x 12 points is worth solving: draw more"):
+        jaxba.make_env("paper", *SMALL)
+
+
+@pytest.mark.slow
+def test_a_reward_that_is_no_number_ends_the_training_in_a_new_folder(env, tmp_path):
+    broken = replace(env, config=replace(env.config, reward=lambda step, best, success: jnp.nan * step.cost))
+    with pytest.raises(TrainError, match="chunk 1: all transitions hold numbers that are not finite; look at the rew"):
+        jaxba.train(broken, steps=8, folder=tmp_path / "new" / "run")
+    assert (tmp_path / "new" / "run").is_dir()
 
 
 def test_windows_of_problems_in_memory_are_those_of_their_files(tmp_path):
