@@ -98,11 +98,8 @@ def trained_elsewhere(config: PaperConfig, source: Source, kind: Agent, method: 
 
 def with_state_size(size: int) -> Agent:
     """The agent that observes the last `size` errors."""
-    return (
-        OURS
-        if size == PAPER_STATE
-        else replace(OURS, name=f"agent-state-{size}", overrides=(f"game.agent.history={size}",))
-    )
+    other = replace(OURS, name=f"agent-state-{size}", overrides=(f"game.agent.history={size}",))
+    return OURS if size == PAPER_STATE else other
 
 
 def train_config(config: PaperConfig, agent: Agent) -> TrainConfig:
