@@ -415,6 +415,7 @@ def test_the_orientation_that_a_photograph_asks_for_is_not_made(sequence):
     assert image_reader(read_sequence(sequence))(3).shape == (SMALL.height, SMALL.width)
 
 
+@pytest.mark.slow
 def test_hidden_files_change_nothing(rendered, sequence, tmp_path):
     (image(sequence, 0).parent / "._000000.png").write_bytes(b"\0\5\x16\7Mac OS X")
     assert build(rendered[SMALL], tmp_path / "a.txt") == 0

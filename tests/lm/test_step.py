@@ -258,7 +258,7 @@ def test_cameras_and_points_that_nobody_observes_do_not_move():
     assert np.asarray(before.points).shape == np.asarray(after.points).shape
 
 
-@pytest.mark.parametrize("name", ["explicit", "implicit"])
+@pytest.mark.parametrize("name", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
 def test_float32_steps_agree_with_float64_to_single_precision(name):
     single = ConjugateGradients(forcing=0.0, tolerance=1e-6, max_iterations=200)
     options = StepOptions(linear_solver=name, conjugate_gradients=single)

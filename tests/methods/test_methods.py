@@ -62,11 +62,18 @@ def _system(layout, state, damping, options):
     return DampedSystem.of(layout, linear, state.cameras, state.points, damping, options)
 
 
+MADE = [
+    pytest.param(support.tiny, id="tiny", marks=pytest.mark.slow),
+    pytest.param(support.odd, id="odd", marks=pytest.mark.slow),
+    pytest.param(support.whitened, id="whitened"),
+]
+"""Problems of which one with weights holds what the others hold."""
+
 # STBA
 
 
 @pytest.mark.parametrize("damping", DAMPINGS)
-@pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened], ids=["tiny", "odd", "whitened"])
+@pytest.mark.parametrize("make", MADE)
 def test_stba_with_one_cluster_is_the_exact_step(make, damping):
     check_step(make(), ONE_CLUSTER, damping)
 
@@ -191,7 +198,7 @@ def test_an_inexact_step_predicts_what_its_own_linear_model_says(options):
 
 
 @pytest.mark.parametrize("damping", [1e-2, 100.0])
-@pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened], ids=["tiny", "odd", "whitened"])
+@pytest.mark.parametrize("make", MADE)
 def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
     check_step(make(), NORMAL, damping)
 
@@ -220,7 +227,9 @@ def test_the_power_series_comes_closer_with_every_order(damping, left):
 # All of them
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", ["lm", "stba", *(pytest.param(x, marks=pytest.mark.slow) for x in ("deeplm", "poba"))]
+)
 def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
     problem = support.tiny()
     small = f"{method}:3" if method == "stba" else method

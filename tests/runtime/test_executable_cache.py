@@ -89,11 +89,11 @@ def call(x, power=1):
 @pytest.mark.parametrize(
     "how",
     [
-        {"policy": "ceres+embedded", "compilation": "auto"},
+        pytest.param({"policy": "ceres+embedded", "compilation": "auto"}, marks=pytest.mark.slow),
         {"policy": "ceres", "dtype": "mixed"},
         {"policy": "ceres+embedded", "method": "stba"},
         {"policy": "ceres", "linear_solver": "implicit"},
-        {"policy": "ceres+embedded", "pad": True},
+        pytest.param({"policy": "ceres+embedded", "pad": True}, marks=pytest.mark.slow),
     ],
     ids=str,
 )

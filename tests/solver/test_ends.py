@@ -28,7 +28,7 @@ def beyond(offset: float = 1e3) -> BundleProblem:
     return problem.replace(observations=geometry.project(problem) + offset)
 
 
-@pytest.mark.parametrize("method", ["lm", "deeplm"])
+@pytest.mark.parametrize("method", ["lm", pytest.param("deeplm", marks=pytest.mark.slow)])
 def test_a_solve_in_which_no_observation_has_a_weight_is_no_success(method):
     found = jaxba.solve(beyond(), "ceres", SolveOptions(loss=Loss("tukey", 2.0), method=method))
     assert (found.termination, found.iterations) == (Termination.NO_WEIGHT, 1)
@@ -108,7 +108,7 @@ def test_no_policy_changes_the_sign_of_a_focal_length(name):
     assert (np.diff([found.initial_cost, *found.history.cost]) <= 0).all()
 
 
-@pytest.mark.parametrize("method", ["stba:3", "deeplm", "poba"])
+@pytest.mark.parametrize("method", ["stba:3", *(pytest.param(x, marks=pytest.mark.slow) for x in ("deeplm", "poba"))])
 def test_nor_does_any_method(method):
     found = jaxba.solve(mirrored(), "gauss-newton", SolveOptions(max_iterations=15, method=method))
     assert (found.problem.cameras[:, 6] > 0).all()

@@ -167,7 +167,7 @@ def test_the_gradient_vanishes_at_an_exact_optimum():
     assert solution.history.gradient_max[0] <= 1e-6
 
 
-@pytest.mark.parametrize("cluster_cameras", [2, 100])
+@pytest.mark.parametrize("cluster_cameras", [2, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_rejected_step_is_repeated_where_clusters_take_turns(cluster_cameras):
     """With the same lambda the next clustering makes another step; a single cluster makes the same one for ever."""
     options = StepOptions(method=StochasticClusters(cluster_cameras=cluster_cameras))
@@ -324,7 +324,9 @@ def test_a_problem_of_jax_arrays_is_solved_like_one_of_numpy_arrays():
     assert np.array_equal(solution.history.cost, stepwise(support.tiny()).history.cost)
 
 
-@pytest.mark.parametrize("name", ["huber", "soft_l1", "cauchy", "tukey"])
+@pytest.mark.parametrize(
+    "name", ["huber", *(pytest.param(x, marks=pytest.mark.slow) for x in ("soft_l1", "cauchy", "tukey"))]
+)
 def test_the_final_cost_counts_the_loss(name):
     options = StepOptions(loss=Loss(name, 1.7))
     solution = stepwise(support.tiny(), options=options)

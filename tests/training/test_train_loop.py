@@ -114,6 +114,7 @@ def test_critics_see_what_the_policy_does_not() -> None:
     np.testing.assert_allclose(values, [[-1.25, 0.75]] * 2, atol=0.15)
 
 
+@pytest.mark.slow
 def test_without_the_privilege_critics_see_what_the_policy_sees() -> None:
     plain_critics = dataclasses.replace(TWIN, privileged=False)
     state = start(plain_critics, SHORT, toys.HIDDEN, jax.random.key(0))
