@@ -92,7 +92,7 @@ def ours(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
 
 def peer(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
     """SAC of sbx, by way of Gymnasium."""
-    from sbx import SAC
+    from sbx import SAC  # pyright: ignore[reportMissingImports]
 
     from examples.gym_sbx import ForStableBaselines
     from jaxba.game.gym import GymVectorGame

@@ -98,7 +98,7 @@ class GameConfig:
 def _check_reward(reward: RewardFunction) -> None:
     """Traces a user's reward. Raises ValueError: it cannot be traced, or returns anything but one number."""
     scalar = lambda kind: jax.ShapeDtypeStruct((), kind)
-    step = StepInfo(*[scalar(KINDS.get(name, jnp.float32)) for name in StepInfo._fields])
+    step = StepInfo._make(scalar(KINDS.get(name, jnp.float32)) for name in StepInfo._fields)
     try:
         found = jax.eval_shape(lambda *of: jnp.asarray(reward(*of)), step, scalar(jnp.float32), scalar(bool))
     except Exception as error:
