@@ -166,8 +166,8 @@ def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distr
         wheel.unlink()
         code = (
             "from jaxba.settings.configurations import find, names, read\n"
-            f"kinds, expected, file = {KINDS!r}, {expected!r}, {str(installed / 'jaxba/configs/train/default.yaml')!r}\n"
-            "assert str(find('train', 'default')) == file\n"
+            f"kinds, expected, at = {KINDS!r}, {expected!r}, {str(installed / 'jaxba/configs/train/default.yaml')!r}\n"
+            "assert str(find('train', 'default')) == at\n"
             "assert {kind: {name: read(kind, name) for name in names(kind)} for kind in kinds} == expected\n"
         )
         env = {**os.environ, "PYTHONPATH": str(installed)}
