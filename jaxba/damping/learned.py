@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.features import Memory, begin, observe, record
+from jaxba.damping.features import Memory, begin, observation_size, observe, record
 from jaxba.damping.guard import GuardState, damping_of, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
@@ -123,6 +124,13 @@ def without_weights(policy: LearnedPolicy) -> LearnedPolicy:
     zeros = jax.tree.map(jnp.zeros_like, policy.layers)
     last = zeros[-1]._replace(bias=policy.layers[-1].bias)
     return replace(policy, layers=(*zeros[:-1], last))
+
+
+def always(action: float, config: AgentConfig) -> LearnedPolicy:
+    """The same action in every state, as a network of one layer without weights: so that it can be a policy file."""
+    inside = 1 - np.finfo(np.float32).eps  # where arctanh is finite
+    bias = np.array([np.arctanh(np.clip(action, -inside, inside)), 0], np.float32)
+    return LearnedPolicy((Layer(np.zeros((observation_size(config), 2), np.float32), bias),), config)
 
 
 def learned_from(config: AgentConfig, actor: Any) -> LearnedPolicy:

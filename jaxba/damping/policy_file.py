@@ -72,10 +72,7 @@ def load_policy(path: str | Path) -> LearnedPolicy:
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")
     try:
-        agent = json.loads(metadata["agent"])
-        if agent.pop("effort", "fixed") != "fixed":  # a setting of earlier versions
-            raise ValueError("its actions decide more than lambda")
-        config = read(AgentConfig, agent)
+        config = read(AgentConfig, json.loads(metadata["agent"]))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be used by this version: {error}") from None
     count = len(tensors) // 2

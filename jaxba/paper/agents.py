@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxba.bench.sources import Source
-from jaxba.damping import ConstantAction, save_policy
+from jaxba.damping import save_policy
+from jaxba.damping.learned import always
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import best_constant_action
 from jaxba.game.scene_bank import Bank, Split, select
@@ -156,14 +157,19 @@ def train(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str
     return True
 
 
-def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> ConstantAction:
-    """The agent's twin without learning: the constant action with the fewest iterations on its training scenes, under
-    the same guard and step."""
-    report(f"{agent.name}: best constant action")
-    work, played = game_of(config, agent, folder, report)
-    banks, rules = task.first_scenes(played.banks, work.held_out), played.config
-    limits = rules.tolerance, rules.max_iterations
-    return best_constant_action(played.kinds, banks, rules.agent, played.options, *limits)
+def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> Path:
+    """The file of an agent's twin without learning, which this makes if it is not there: the constant action with the
+    fewest iterations on the agent's training scenes, under the same guard and step."""
+    path = folder / "agents" / f"{agent.name}-constant.safetensors"
+    if not path.is_file():
+        report(f"{agent.name}: best constant action")
+        work, played = game_of(config, agent, folder, report)
+        banks, rules = task.first_scenes(played.banks, work.held_out), played.config
+        limits = rules.tolerance, rules.max_iterations
+        found = best_constant_action(played.kinds, banks, rules.agent, played.options, *limits)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_policy(path, always(found.action[0], found.config))
+    return path
 
 
 def collapsed(config: PaperConfig, agent: Agent, folder: Path) -> list[bool]:

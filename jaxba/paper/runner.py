@@ -16,7 +16,7 @@ import numpy as np
 from jaxba.bench import profile
 from jaxba.bench.run import RunSettings, record_of, run_solver
 from jaxba.bench.sources import Source
-from jaxba.damping import ConstantAction, DampingPolicy, load_policy
+from jaxba.damping import DampingPolicy, load_policy
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import Bank, reach
 from jaxba.paper import agents, results, zero_net
@@ -113,39 +113,44 @@ class Runner:
         self.done = 0
         """Number of solves, plays and trainings that this process has done."""
         self._read: tuple[Source, BundleProblem] | None = None
-        self._constants: dict[str, ConstantAction] = {}
 
     # Policies
 
-    def agent(self, kind: Agent, linear: LinearSolverChoice = "auto", method: str = "lm") -> Method:
-        """The method with an agent, which is trained on synthetic scenes when it is first built."""
+    def agent(
+        self, kind: Agent, linear: LinearSolverChoice = "auto", method: str = "lm", *, twin: bool = False
+    ) -> Method:
+        """The method with an agent, which is trained on synthetic scenes when it is first built; or its twin without
+        learning, the best constant action on its training scenes."""
         if method != "lm":
             kind = replace(kind, name=f"{method}+{kind.name}", overrides=(*kind.overrides, f"method={method}"))
-        name = kind.name if linear == "auto" else f"{kind.name}/{linear}"
-        return self._method(name, lambda _: kind, method, linear=linear)
+        return self._method(kind.name, lambda _: kind, method, linear=linear, twin=twin)
 
-    def elsewhere(self, kind: Agent, method: str = "lm") -> Method:
-        """The method with agents trained on windows of real problems other than the one to solve, with its steps. The
-        steps of a peer are those of plain LM."""
+    def elsewhere(self, kind: Agent, method: str = "lm", *, twin: bool = False) -> Method:
+        """The same with agents trained on windows of real problems other than the one to solve. The steps of a peer are
+        those of plain LM."""
         library = parse_solver(method) if method.partition(":")[0] in PEERS else None
         steps = "lm" if library else method
         find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, steps)
         name = f"{kind.name}{ELSEWHERE}"
-        return self._method(name if method == "lm" else f"{method}+{name}", find, method, library)
+        return self._method(name if method == "lm" else f"{method}+{name}", find, method, library, twin=twin)
 
     def _method(
         self,
         name: str,
         find: Callable[[Source | None], Agent | None],
-        method: str = "lm",
+        method: str,
         library: SolverName | None = None,
         linear: LinearSolverChoice = "auto",
+        *,
+        twin: bool,
     ) -> Method:
         def file(seed: int, source: Source | None) -> Path | None:
-            agent = find(source)
+            agent, where = find(source), (self.folder, self.report)
             if agent is None:
                 return None
-            self.done += agents.train(self.config, agent, self.folder, self.report)
+            if twin:
+                return agents.best_constant(self.config, agent, *where)
+            self.done += agents.train(self.config, agent, *where)
             return agents.own_folder(agent, self.folder) / agents.POLICY.format(seed + 1)
 
         def build(seed: int, source: Source | None) -> Built | None:
@@ -155,23 +160,11 @@ class Runner:
         def collapsed(of: Sequence[Source | None]) -> bool:
             named = {agent.name: agent for source in of if (agent := find(source))}
             found = [one for agent in named.values() for one in agents.collapsed(self.config, agent, self.folder)]
-            return 2 * sum(found) > len(found)
+            return not twin and 2 * sum(found) > len(found)
 
-        return Method(name, build, self.config.agents.seeds, library, file if library else None, collapsed)
-
-    def twin(self, kind: Agent, linear: LinearSolverChoice = "auto", *, elsewhere: bool = False) -> Method:
-        """The best constant action of an agent on its training scenes, under its guard and with its step."""
-
-        def build(_: int, source: Source | None) -> Built | None:
-            agent = agents.trained_elsewhere(self.config, source, kind) if elsewhere and source else kind
-            if agent is None:
-                return None
-            if agent.name not in self._constants:
-                self._constants[agent.name] = agents.best_constant(self.config, agent, self.folder, self.report)
-            return self._constants[agent.name], SolveOptions(linear_solver=linear)
-
-        name = f"{kind.name}{ELSEWHERE * elsewhere}{CONSTANT}"
-        return Method(name if linear == "auto" else f"{name}/{linear}", build)
+        name += CONSTANT * twin + f"/{linear}" * (linear != "auto")
+        seeds = 0 if twin else self.config.agents.seeds
+        return Method(name, build, seeds, library, file if library else None, collapsed)
 
     def zero_net(self) -> Method:
         """The method with the Zero-net, with as many training runs as an agent."""

@@ -13,9 +13,10 @@ from test_learned import random_policy
 from jaxba import SolveOptions, StepOptions, make_policy, perturb, random_scene, scene_like, solve
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.features import begin
+from jaxba.damping.features import begin, observation_size
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, without_weights
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, always, without_weights
+from jaxba.damping.policy_file import save_policy
 from jaxba.solver.names import parse_solver
 
 
@@ -75,6 +76,16 @@ def test_bold_has_the_step_of_rules_with_embedded_iterations(name):
     assert isinstance(policy, ConstantAction)
     assert options.step_options(policy) == policy.step_options(StepOptions())
     assert options.step_options(policy) == parse_solver("ceres+embedded").build()[1].step_options(make_policy("ceres"))
+
+
+@pytest.mark.parametrize("action", [-1.0, -0.25, 1.0])
+def test_a_constant_action_can_be_a_policy_file(action, tmp_path):
+    config = AgentConfig(history=2)
+    save_policy(tmp_path / "constant.safetensors", always(action, config))
+    policy = make_policy(str(tmp_path / "constant.safetensors"))
+    for seed in range(3):
+        seen = np.random.default_rng(seed).normal(size=observation_size(config)).astype(np.float32)
+        np.testing.assert_allclose(policy.act(jnp.asarray(seen)), [action], rtol=1e-6)
 
 
 def test_bold_is_written_by_hand():

@@ -118,7 +118,6 @@ BAD = {
     "no json": (GOOD, _facts(agent="{"), "cannot be used"),
     "json, but no settings": (GOOD, _facts(agent="[1, 2]"), "cannot be used"),
     "unknown setting": (GOOD, _agent(colour="red"), "colour"),
-    "actions of earlier versions": (GOOD, _agent(effort="points+repairs"), "more than lambda"),
     "unknown observation": (GOOD, _agent(observation="everything"), "observation"),
     "wrong type": (GOOD, _agent(history="5"), "history"),
     "not a number": (GOOD, _agent(escalate=float("nan")), "escalate"),

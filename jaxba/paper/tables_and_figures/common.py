@@ -50,8 +50,14 @@ def ours(runner: Runner, paper: float = math.nan, paper_s: float = math.nan, *, 
         Line("the paper's agent, as printed", made(PRINTED)),
         Line("ours: the paper's agent, tuned", made(OURS), paper, paper_s),
         Line("ours: scale-free state and guard", made(BEST), paper, paper_s),
-        Line("its twin: best constant lambda", runner.twin(BEST, elsewhere=elsewhere)),
+        Line("its twin: best constant lambda", made(BEST, twin=True)),
     ]
+
+
+def with_twin(label: str, made: Callable[..., Method], *of: str, paper: float, paper_s: float = math.nan) -> list[Line]:
+    """The lines of another solver that the best agent drives, and of its twin without learning."""
+    line = Line(f"{label} + ours, scale-free state and guard", made(BEST, *of), paper, paper_s)
+    return [line, Line(f"{label} + its twin", made(BEST, *of, twin=True))]
 
 
 @dataclass(frozen=True)

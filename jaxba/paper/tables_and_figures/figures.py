@@ -147,7 +147,7 @@ def _convergence(runner: Runner) -> list[Part]:
     lines = lambda linear: [
         *(named(f"{name}, {linear}", f"{name}/{linear}") for name in (CLASSIC, CERES)),
         Line(f"ours: scale-free state and guard, {linear}", runner.agent(agents.BEST, linear)),
-        Line(f"its twin, {linear}", runner.twin(agents.BEST, linear)),
+        Line(f"its twin, {linear}", runner.agent(agents.BEST, linear, twin=True)),
     ]
     implicit = lines("implicit")
     return [

@@ -3,6 +3,7 @@ families in seconds."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 from jaxba.bench.sources import Source
@@ -10,7 +11,7 @@ from jaxba.paper import claims, real_problems
 from jaxba.paper.agents import BEST, FEW, OURS
 from jaxba.paper.claims import Statement, ratio_claim, success_claim, time_claim
 from jaxba.paper.runner import ELSEWHERE, Runner, method_named
-from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Line, Part, Table, named, ours
+from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Line, Part, Table, named, ours, with_twin
 
 CERES_ITSELF = "pyceres:sparse"
 """Ceres under its own rule; needs the extra `ceres`."""
@@ -48,7 +49,7 @@ def _kitti(runner: Runner) -> list[Part]:
         named("STBA", "stba+stba", 80.0, 287.4),
         named("classic", CLASSIC, 75.0, 340.0),
         named("Ceres' rule", CERES),
-        Line("STBA + ours, scale-free state and guard", runner.elsewhere(BEST, "stba"), 16.0, 110.0),
+        *with_twin("STBA", runner.elsewhere, "stba", paper=16.0, paper_s=110.0),
         *ours(runner, 14.0, 100.2, elsewhere=True),
     ]
     with_stba = "KITTI: ours takes a fifth of STBA's iterations"
@@ -82,10 +83,10 @@ def _bal(runner: Runner) -> list[Part]:
     lines = [
         named("DeepLM's solver", "deeplm+ceres", 15.0, 40.75),
         named("Ceres, C++", CERES_ITSELF, 20.0, 46.7),
-        Line("Ceres, C++, + ours, scale-free state and guard", runner.elsewhere(BEST, CERES_ITSELF), 4.0, 20.75),
+        *with_twin("Ceres, C++", runner.elsewhere, CERES_ITSELF, paper=4.0, paper_s=20.75),
         named("classic", CLASSIC, 20.0, 110.0),
         named("Ceres' rule", CERES),
-        Line("DeepLM's solver + ours, scale-free state and guard", runner.elsewhere(BEST, "deeplm"), 5.0, 20.3),
+        *with_twin("DeepLM's solver", runner.elsewhere, "deeplm", paper=5.0, paper_s=20.3),
         *ours(runner, 4.0, 62.04, elsewhere=True),
     ]
     over = lambda test, text, paper, ours, base: Statement(test, f"BAL: {text}", paper, ours, base)
@@ -128,20 +129,20 @@ def _synthetic(runner: Runner) -> list[Part]:
 
     def part(problems: real_problems.Problems, paper: float, classic: float, other: str, own: float, alone: float):
         name, method = {"stba": ("STBA", "stba+stba"), "deeplm": ("DeepLM", "deeplm+ceres")}[other]
-        driver = runner.agent(BEST, method=other)
+        driven = with_twin(name, runner.agent, "auto", other, paper=own)
         lines = [
             named("classic", CLASSIC, classic),
             named("Ceres' rule", CERES),
             Line(few, runner.agent(FEW), paper),
             named(name, method, alone),
-            Line(f"{name} + ours, scale-free state and guard", driver, own),
+            *driven,
             *ours(runner, paper),
         ]
         text = "Synthetic training, {}: fraction of %s's iterations (%s)"
         stated = [
             Statement(ratio_claim, text % (CLASSIC, "tuned"), paper / classic, OURS.name, CLASSIC),
             Statement(ratio_claim, text % (CLASSIC, "guarded"), paper / classic, BEST.name, CLASSIC),
-            Statement(ratio_claim, text % (name, "guarded"), own / alone, driver.name, method),
+            Statement(ratio_claim, text % (name, "guarded"), own / alone, driven[0].method.name, method),
         ]
         return Part(problems, lines, stated)
 
@@ -180,7 +181,7 @@ def _families(runner: Runner) -> list[Part]:
         lines = [
             named("Ceres-CG", "pyceres:iterative"),
             named("DeepLM", "deeplm+ceres"),
-            Line("DeepLM + ours, scale-free state and guard", runner.elsewhere(BEST, "deeplm")),
+            *with_twin("DeepLM", runner.elsewhere, "deeplm", paper=math.nan),
             *ours(runner, elsewhere=True),
         ]
         paper = FAMILY_SECONDS.get(family.name)  # the paper has no numbers of other families
