@@ -37,7 +37,6 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         f", up to {work.trials} trials": work.trials > 1,
         f", up to {counted(work.pattern_moves, 'pattern move')}": work.pattern_moves,
         ", distortion per pixel": coordinates.lens_step == "pixels",
-        f", cameras damped by {coordinates.camera_damping:g} lambda": coordinates.camera_damping != 1,
     }
     refine = "".join(text for text, present in parts.items() if present)
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"

@@ -60,9 +60,6 @@ class AgentConfig:
     refinement: Refinement = field(default_factory=Refinement)
     """Embedded iterations of the step."""
 
-    camera_damping: float = 1.0
-    """Damping of the cameras relative to that of the points, `Coordinates.camera_damping`."""
-
     lens_step: LensStep = "file"
     """How a step is added to focal length and distortion, `Coordinates.lens_step`."""
 
@@ -87,8 +84,8 @@ class AgentConfig:
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:
-        """The options with this configuration's embedded iterations, damping of cameras and lens coordinates."""
-        coordinates = replace(options.coordinates, camera_damping=self.camera_damping, lens_step=self.lens_step)
+        """The options with this configuration's embedded iterations and lens coordinates."""
+        coordinates = replace(options.coordinates, lens_step=self.lens_step)
         return replace(options, refinement=self.refinement, coordinates=coordinates)
 
 

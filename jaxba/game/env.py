@@ -41,14 +41,10 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
 
-Reward = Literal["duration", "constant", "reduction", "reversed", "clock"]
+Reward = Literal["constant", "clock", "reduction", "reversed"]
 
 RewardFunction = Callable[[StepInfo, Array, Array], Array]
 """Of an iteration, the best known cost of the scene, and whether the episode has ended in success."""
-
-POINT_ITERATION_COST = 0.1
-"""Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
-Ladybug-49: three take 3.9 of 12.6 ms."""
 
 DISTANCE_FLOOR = 1e-6
 """Relative distance to the best known cost that a critic does not distinguish from zero."""
@@ -64,11 +60,11 @@ class GameConfig:
     agent: AgentConfig = field(default_factory=AgentConfig)
     """What the agent observes and decides."""
 
-    reward: Reward | RewardFunction = "duration"
-    """Of an iteration: a function, or a name. `duration`: minus a deterministic cost of the iteration. `clock`: minus
-    its duration by a clock, which varies as measured ones do. `constant`: -1. `reduction`: zero, and the bonus shrinks
-    with every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's reversed roles of
-    state and reward). Bonus and scale are those of a name; a function's number is the whole reward."""
+    reward: Reward | RewardFunction = "constant"
+    """Of an iteration: a function, or a name. `constant`: -1. `clock`: minus its duration by a clock, which varies as
+    measured ones do. `reduction`: zero, and the bonus shrinks with every iteration. `reversed`: minus log10 of the cost
+    over the best known cost (the paper's reversed roles of state and reward). Bonus and scale are those of a name; a
+    function's number is the whole reward."""
 
     bonus: float = 10.0
     """Added if the episode ends in success. Source: Belder et al. 2023."""
@@ -261,12 +257,10 @@ class Game:
         bonus = jnp.where(success, rules.bonus, 0.0)
         if callable(rules.reward):
             return jnp.asarray(rules.reward(step, best, success))
-        if rules.reward == "duration":
-            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refinement.points)
+        if rules.reward == "constant":
+            reward = bonus - 1
         elif rules.reward == "clock":
             reward = bonus - duration(step)
-        elif rules.reward == "constant":
-            reward = bonus - 1
         elif rules.reward == "reduction":
             reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
         else:

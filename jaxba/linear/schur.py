@@ -169,8 +169,7 @@ def camera_system(
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
-    factor = options.coordinates.camera_damping * damping
-    extra = layout.unknowns.shares(damping_diagonal(layout.unknowns.sums(diagonal), factor, options))
+    extra = layout.unknowns.shares(damping_diagonal(layout.unknowns.sums(diagonal), damping, options))
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     on_manifold = jnp.einsum("cji,cj,cjk->cik", inverse, extra[:, :3], inverse)

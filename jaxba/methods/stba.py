@@ -7,7 +7,7 @@ Each iteration draws a partition of the cameras into clusters (structure/random_
 2. A few Richardson iterations on the true reduced camera system correct the camera step.
 3. The points follow by back-substitution, unsplit.
 
-Lambda damps cameras (times `camera_damping`), points and replicas. With a large lambda the step is nearly a
+Lambda damps cameras, points and replicas. With a large lambda the step is nearly a
 steepest-descent step, in which the replicas of a point differ; `consensus_gradient` makes them agree.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,

@@ -95,10 +95,6 @@ class Coordinates:
     """Damping matrix: `diagonal`: `lambda diag(H)` with a clamped diagonal (Ceres); `identity`: `lambda I` (the paper
     on learned damping)."""
 
-    camera_damping: float = 1.0
-    """Factor on lambda for cameras. 1 is Levenberg-Marquardt as published; with a small factor mostly points are
-    damped."""
-
     rotation: Rotation = "angle-axis"
     """Coordinates of a rotation step: `angle-axis`: addition to the angle-axis vector, as Ceres does with BAL cameras;
     `manifold`: `R <- exp(step) R`. Diagonal damping differs between them."""
@@ -110,8 +106,6 @@ class Coordinates:
     def __post_init__(self) -> None:
         for name, known in (("scaling", Scaling), ("rotation", Rotation), ("lens_step", LensStep)):
             _check_known(name, getattr(self, name), known)
-        if not 0 < self.camera_damping < float("inf"):
-            raise ValueError(f"camera_damping must be positive and finite, is {self.camera_damping}")
 
 
 class MethodTraits:

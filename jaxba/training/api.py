@@ -111,6 +111,8 @@ def train(
         ValueError: an impossible number.
         TrainError: losses or all transitions are not finite, or the folder holds another run.
     """
+    if not isinstance(env, PresetGame):
+        raise ValueError(f"env must be a game of jaxba.make_env, not {env!r}")
     if steps < 1:
         raise ValueError(f"steps must be at least 1, not {steps}")
     rounds = -(-steps // env.num_envs)

@@ -154,6 +154,8 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
     """
     data = configurations.read("train", name)
     for override in overrides:
+        if not isinstance(override, str):
+            raise SettingsError(f"settings are text such as 'sac.width=128', not {override!r}")
         key, equals, value = override.partition("=")
         if not equals or not key:
             raise SettingsError(f"--set {override}: must be key=value")

@@ -217,9 +217,7 @@ def baseline_policies(
             out if the agent's step has none; the rule that belongs to the method comes first.
     """
     plain = config.step_options
-    coordinates = replace(options.coordinates, camera_damping=plain.coordinates.camera_damping)
-    embedded = replace(options, coordinates=coordinates)
-    has_embedded = embedded.refinement != plain.refinement
+    has_embedded = options.refinement != plain.refinement
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     found: dict[str, tuple[DampingPolicy, StepOptions]] = {}
     for name in (*own, *names):
@@ -235,7 +233,7 @@ def baseline_policies(
         elif rule == name:
             found[name] = make_policy(rule), plain
         elif has_embedded:
-            found[name] = make_policy(rule), embedded
+            found[name] = make_policy(rule), options
     return found
 
 

@@ -12,19 +12,17 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import support
 from support import solve
 
-from jaxba import Refinement, SolveOptions, StepOptions, read_bal, read_problem, write_bal, write_bundler
+from jaxba import Refinement, SolveOptions, read_bal, read_problem, write_bal, write_bundler
 from jaxba.cli import table
 from jaxba.cli.solve import Arguments, run, solve_options, with_settings
 from jaxba.io import json_lines
 from jaxba.problem import geometry
-from jaxba.problem.options import Coordinates
 from jaxba.solver.record import Record
 
 RECORD_KEYS = [
@@ -533,12 +531,3 @@ def test_errors_of_the_parser_are_one_line_with_status_2_and_print_nothing_on_st
 def test_the_parser_proposes_the_nearest_option(capsys):
     assert run(["--polcy", "ceres"]) == 2
     assert capsys.readouterr().err.endswith("perhaps you meant --policy\n")
-
-
-@pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
-def test_the_heading_reports_a_different_damping_of_cameras(factor, said):
-    args = SimpleNamespace(
-        policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto", compilation="full"
-    )
-    text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
-    assert ("cameras damped by 0.01 lambda" in text) == said

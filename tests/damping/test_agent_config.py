@@ -29,7 +29,6 @@ numbers = st.fixed_dictionaries(
             st.sampled_from(["step", "rays"]),
             *(st.integers(1, 6), st.integers(0, 4), st.integers(0, 4)),
         ),
-        camera_damping=st.floats(1e-6, 1e6),
         lens_step=st.sampled_from(["file", "pixels"]),
     )
 )
@@ -44,7 +43,7 @@ def test_a_configuration_comes_back_from_its_numbers(numbers):
     made = config.step_options(StepOptions(conjugate_gradients=ConjugateGradients(forcing=0.2)))
     assert made.conjugate_gradients.forcing == 0.2
     assert made.refinement == config.refinement
-    assert made.coordinates == Coordinates(camera_damping=config.camera_damping, lens_step=config.lens_step)
+    assert made.coordinates == Coordinates(lens_step=config.lens_step)
 
 
 @pytest.mark.parametrize(
@@ -79,10 +78,8 @@ def test_a_configuration_comes_back_from_its_numbers(numbers):
         ({"refinement": {"points": -1}}, "points"),
         ({"refinement": {"trials": 0}}, "trials"),
         ({"refinement": 3}, "refinement"),
-        ({"camera_damping": 0.0}, "camera_damping"),
         ({"lens_step": "zoom"}, "lens_step"),
         ({"refinement": {"starts": True}}, "starts"),
-        ({"camera_damping": float("inf")}, "camera_damping"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

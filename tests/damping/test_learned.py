@@ -297,30 +297,11 @@ def test_the_shipped_policy_is_wired_as_the_preset_of_its_files_name():
     assert load_policy(registry.SHIPPED).config == load(registry.SHIPPED.stem).game.agent
 
 
-def test_the_shipped_policy_chooses_lambda_alone_and_damps_cameras_as_points():
+def test_the_shipped_policy_chooses_lambda_alone():
     """Which is all that Ceres' one radius can do."""
     for name in ("learned", "pyceres:dense+learned"):
         policy, options = parse_solver(name).build()
         assert options.step_options(policy) == StepOptions()
-
-
-@pytest.mark.parametrize("refine", [None, 0, 4])
-def test_the_camera_damping_of_a_policys_training_goes_with_it_whatever_the_point_iterations(tmp_path, refine):
-    path = tmp_path / "mine.safetensors"
-    trained = random_policy(5)
-    save_policy(path, replace(trained, config=replace(trained.config, camera_damping=0.01)))
-    assert SolverName(str(path), refine).build()[1].coordinates.camera_damping == 0.01
-
-
-@pytest.mark.slow
-def test_a_solve_damps_cameras_as_the_policy_was_trained():
-    trained = random_policy(1)
-    light = replace(trained, config=replace(trained.config, camera_damping=0.01))
-    found = solve(scene(0), light, max_iterations=3)
-    asked = solve(scene(0), light, options=light.config.step_options(StepOptions()), max_iterations=3)
-    other = solve(scene(0), trained, max_iterations=3)
-    assert np.array_equal(found.history.cost, asked.history.cost)
-    assert not np.array_equal(found.history.cost, other.history.cost)
 
 
 # Solves

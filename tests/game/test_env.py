@@ -14,13 +14,11 @@ import pytest
 from support import same_bits
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
-from jaxba import StepOptions
 from jaxba.damping.features import begin, duration, observation_size, observe
 from jaxba.damping.guard import damping_of
-from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
+from jaxba.game.env import Game, GameConfig
 from jaxba.game.protocol import Environment
 from jaxba.game.scene_bank import Bank
-from jaxba.problem.options import Refinement
 
 _jitted_reset = jax.jit(lambda game, key: game.reset(key))
 _jitted_step = jax.jit(lambda game, state, action: game.step(state, action))
@@ -140,7 +138,6 @@ def _reward(config: GameConfig, cost: float, best: float, iteration: int, succes
     """By hand; `iteration` counts from one, `time` is what the clock says."""
     bonus = config.bonus if success else 0.0
     value = {
-        "duration": bonus - 1,  # no point iterations in this game
         "clock": bonus - time,
         "constant": bonus - 1,
         "reduction": bonus * (1 - 0.01 * (iteration - 1)),
@@ -152,7 +149,6 @@ def _reward(config: GameConfig, cost: float, best: float, iteration: int, succes
 @pytest.mark.parametrize(
     "config",
     [
-        replace(RULES, reward="duration"),
         replace(RULES, reward="constant", bonus=3.0, scale=1.0),
         replace(RULES, reward="reduction"),
         replace(RULES, reward="reversed"),
@@ -186,17 +182,6 @@ def test_rewards_are_those_of_the_contract(config):
 
 def tiny_info():
     return jax.tree.map(lambda x: x[0], tiny_bank().info)
-
-
-def test_a_point_iteration_costs_a_tenth_of_a_linear_solve():
-    from support import step_info
-
-    game = dataclasses.replace(tiny_game(), options=StepOptions(refinement=Refinement(points=3)))
-    memory = begin(AGENT, tiny_info())
-    no = jnp.asarray(False)
-    found = game._reward(step_info(True, cost=5.0, previous_cost=9.0), memory, jnp.asarray(1.0), no)
-    np.testing.assert_allclose(found, -RULES.scale * (1 + 3 * POINT_ITERATION_COST))
-    assert POINT_ITERATION_COST == 0.1
 
 
 def test_the_game_pays_what_it_says():

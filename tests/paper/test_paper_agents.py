@@ -45,7 +45,7 @@ def test_all_kinds_of_agents_are_trained_on_the_same_scenes_side_by_side():
 
 def test_ours_is_the_papers_agent():
     found = agents.train_config(CONFIG, agents.PRINTED)
-    assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "duration")
+    assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "constant")
     assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (10.0, 500, "value", 256)
     assert (found.sac.layers, found.sac.policy_layers) == (2, 3)  # and a linear one: three and four fully connected
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)

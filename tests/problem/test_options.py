@@ -18,9 +18,6 @@ from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions
         (Coordinates, {"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
         (Coordinates, {"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
         (Coordinates, {"lens_step": "zoom"}, "lens_step must be one of file, pixels, not 'zoom'"),
-        (Coordinates, {"camera_damping": 0.0}, "camera_damping must be positive and finite, is 0"),
-        (Coordinates, {"camera_damping": float("nan")}, "camera_damping must be positive and finite, is nan"),
-        (Coordinates, {"camera_damping": float("inf")}, "camera_damping must be positive and finite, is inf"),
         (Refinement, {"points": -1}, "points must be at least 0"),
         (Refinement, {"points": 2.5}, "points must be a whole number, is 2.5"),
         (Refinement, {"points": 2**32}, "points must be at most 2147483647"),
@@ -51,9 +48,8 @@ def test_equal_options_are_one_key_and_different_ones_are_not():
         StepOptions(loss=Loss("huber")),
         StepOptions(conjugate_gradients=ConjugateGradients(forcing=0.5)),
         StepOptions(intrinsics="fixed"),
-        StepOptions(coordinates=Coordinates(camera_damping=0.01)),
     }
-    assert len(different) == 9
+    assert len(different) == 8
 
 
 def test_options_cannot_change_under_a_compiled_program():
@@ -62,7 +58,7 @@ def test_options_cannot_change_under_a_compiled_program():
 
 
 def test_the_defaults_are_those_of_ceres():
-    assert Coordinates() == Coordinates(scaling="diagonal", camera_damping=1.0, rotation="angle-axis", lens_step="file")
+    assert Coordinates() == Coordinates(scaling="diagonal", rotation="angle-axis", lens_step="file")
     rule = ConjugateGradients()
     assert (rule.forcing, rule.tolerance, rule.max_iterations) == (0.1, 0.0, 500)
     assert StepOptions().loss == Loss("squared")

@@ -153,7 +153,8 @@ def test_a_step_is_that_of_the_dense_problem_of_frames(make, solver):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize("policy", [pytest.param("ceres", marks=pytest.mark.slow), "guarded"])
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["ceres", "guarded"])
 def test_where_a_camera_is_in_its_rig_is_found(policy):
     problem = stereo()
     found = solve(problem, policy).problem

@@ -92,7 +92,7 @@ def call(x, power=1):
         pytest.param({"policy": "ceres+embedded", "compilation": "auto"}, marks=pytest.mark.slow),
         {"policy": "ceres", "dtype": "mixed"},
         {"policy": "ceres+embedded", "method": "stba"},
-        {"policy": "ceres", "linear_solver": "implicit"},
+        pytest.param({"policy": "ceres", "linear_solver": "implicit"}, marks=pytest.mark.slow),
         pytest.param({"policy": "ceres+embedded", "pad": True}, marks=pytest.mark.slow),
     ],
     ids=str,

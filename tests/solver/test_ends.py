@@ -97,9 +97,19 @@ def test_without_the_rule_the_focal_length_would_change_its_sign():
 
 
 NAMES = [*POLICIES, "learned", "constant:1e-8"]
+QUICK = {"ceres", "classic", "gauss-newton", "guarded", "ceres+embedded"}
 
 
-@pytest.mark.parametrize("name", [*NAMES, "ceres+refine3", "ceres+embedded", "classic+embedded", "guarded+embedded"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *sorted(QUICK),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in sorted({*NAMES, "ceres+refine3", "classic+embedded", "guarded+embedded"} - QUICK)
+        ),
+    ],
+)
 def test_no_policy_changes_the_sign_of_a_focal_length(name):
     found = jaxba.solve(mirrored(), name, SolveOptions(max_iterations=30, pad=True))
     assert (found.problem.cameras[:, 6] > 0).all()

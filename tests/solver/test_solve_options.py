@@ -83,7 +83,7 @@ def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
 
 
 def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
-    refinement, coordinates = Refinement(points=1, trials=2), Coordinates(camera_damping=0.5, rotation="manifold")
+    refinement, coordinates = Refinement(points=1, trials=2), Coordinates(rotation="manifold")
     trained = trained_step(make_policy(DEFAULT_POLICY))
     one = prepare(support.tiny(), options=SolveOptions(refinement=refinement)).options
     assert (one.refinement, one.coordinates) == (refinement, trained.coordinates)

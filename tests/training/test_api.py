@@ -13,6 +13,7 @@ import jaxba
 from jaxba.game import scene_bank
 from jaxba.game.rollout import play
 from jaxba.game.windows import read_windows
+from jaxba.settings import SettingsError
 from jaxba.training.checkpoint import TrainError
 from jaxba.typing import InputError
 
@@ -64,7 +65,7 @@ def test_a_reward_of_ones_own_is_the_reward(env):
         (lambda step, best: 1.0, "can trace: .*positional arguments"),
         (lambda step, best, success: None, "can trace: "),
         (lambda step, best, success: jnp.stack([step.cost, best]), r"one number, not an array of shape \(2,\)"),
-        ("gain", "must be one of duration"),
+        ("gain", "must be one of constant"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -72,6 +73,14 @@ def test_what_is_no_reward_is_refused_in_one_line_before_scenes_are_made(reward,
     with pytest.raises(ValueError, match=words) as caught:
         jaxba.make_env("paper", *SMALL, reward=reward)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_kinds_of_arguments_are_refused_in_one_line():
+    with pytest.raises(SettingsError, match=r"settings are text such as 'sac.width=128', not \{\}"):
+        jaxba.make_env("paper", {})
+    with pytest.raises(ValueError, match=r"env must be a game of jaxba.make_env, not 'paper'"):
+        jaxba.train("paper", 10)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -75,7 +75,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
     assert found.step_options.linear_solver == "cg"
     assert found.step_options.truncated.forcing == 0  # no policy takes its steps for inexact ones
-    assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
+    assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("constant", 10.0, 500)
     assert found.game.max_iterations == 100
 
 
@@ -146,7 +146,7 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("bank.dtype=64", "bank.dtype must be text, is 64"),
         ("envs=64", "envs must be a list, is 64"),
         ("envs=[a]", "envs[0] must be a whole number, is 'a'"),
-        ("game.reward=fun", "game.reward must be one of duration, constant, reduction, reversed, clock, is 'fun'"),
+        ("game.reward=fun", "game.reward must be one of constant, clock, reduction, reversed, is 'fun'"),
         ("sac.width=[", "not YAML"),
         ("sac.width", "must be key=value"),
         ("chunks=0", "chunks must be at least 1, not 0"),

@@ -71,7 +71,7 @@ both_agents = pytest.mark.parametrize("agent", AGENTS)
 
 
 @both_agents
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("sign", [-1.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_reward_that_is_seen(agent: str, sign: float) -> None:
     np.testing.assert_allclose(opinions(agent, toys.SEEN, sign), sign, atol=0.05)
 
