@@ -67,6 +67,9 @@ def _flags_of_level_quick() -> str:
 WHOLE_ROOMS = ("lm", "linear")
 """Of these rooms `-m sample` has the first case of each test, of the others the first test of each file."""
 
+LABORATORY = ("bench", "game", "kitti", "methods", "paper", "peers", "training")
+"""Of these rooms both samples have the first test of the room."""
+
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -75,7 +78,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         whole = item.path.parent.name in WHOLE_ROOMS
         slow = item.get_closest_marker("slow") is not None
         test = (
-            item.path,
+            item.path.parent if item.path.parent.name in LABORATORY else item.path,
             slow,
             item.originalname if whole and not slow and isinstance(item, pytest.Function) else None,
         )

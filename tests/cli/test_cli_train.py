@@ -88,6 +88,19 @@ def error_of(capsys, *argv: str) -> str:
     return error
 
 
+# Errors
+
+
+def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
+    out = str(tmp_path / "run")
+    assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
+    assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
+    assert "known: default, paper, paper-tuned" in error_of(capsys, "--config", "fast", "--out", out)
+    assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
+    assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
+    assert not (tmp_path / "run").exists()
+
+
 # Results
 
 
@@ -218,16 +231,6 @@ def test_an_agent_is_trained_for_the_given_method(tmp_path):
 
 def test_a_folder_that_has_a_run_is_refused(folder, capsys):
     assert "holds a run already; --resume goes on with it" in error_of(capsys, *COMMAND, "--out", str(folder))
-
-
-def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
-    out = str(tmp_path / "run")
-    assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
-    assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
-    assert "known: default, paper, paper-tuned" in error_of(capsys, "--config", "fast", "--out", out)
-    assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
-    assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
