@@ -30,9 +30,12 @@ from jax import monitoring
 from jaxlib import xla_client
 
 from jaxba.runtime import process
-from jaxba.runtime.atomic import atomic_write
+from jaxba.runtime.atomic import atomic_write, write_text
 
 SUFFIX = ".jaxba-program"
+
+RUNS = ".jaxba-runs"
+"""Ending of the file beside a program that says how often it was run."""
 
 LIMIT = 1 << 30
 """Bytes that a folder's programs may have; the least recently used are removed first."""
@@ -128,6 +131,19 @@ class ExecutableCache:
         with contextlib.suppress(OSError):
             stored.path.unlink()
 
+    def runs(self, path: Path | None) -> int:
+        """How often earlier processes have run a program of this folder."""
+        try:
+            return 0 if path is None else int(path.with_suffix(RUNS).read_text())
+        except (OSError, ValueError):
+            return 0
+
+    def add_runs(self, path: Path | None, count: int) -> None:
+        """Notes runs of a program; does nothing if they cannot be written."""
+        if path is not None and count:
+            with contextlib.suppress(OSError):
+                write_text(path.with_suffix(RUNS), str(self.runs(path) + count))
+
     def _evict(self) -> None:
         """Removes the least recently used programs, down to `LIMIT`."""
         found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
@@ -136,6 +152,7 @@ class ExecutableCache:
             total += status.st_size
             if total > LIMIT:
                 file.unlink(missing_ok=True)
+                file.with_suffix(RUNS).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -64,6 +64,9 @@ class Driver:
         """Seconds of compilation so far."""
         return self.clock.seconds
 
+    def end(self) -> None:
+        """After the last iteration: notes what later solves should know."""
+
     def _ended(self, found: tuple[Carry, StepInfo]) -> tuple[StepInfo, Termination]:
         """The records of all iterations as one, and why the solve ended."""
         self.carry, columns = jax.block_until_ready(found)

@@ -165,6 +165,7 @@ def solve_without(
             if callback and callback(record) and end == Termination.RUNNING:
                 end = Termination.STOPPED
         total_s, compile_s = elapsed(), driver.compile_s()
+        driver.end()
         if compile_s > 0:
             process.release_programs()  # see above: too many programs end a process
         steps = steps or StepInfo.stacked(records)

@@ -57,11 +57,13 @@ class Stepwise(Driver):
         """
         super().__init__(*arguments)
         self._first, self._runs = first, Counter[str]()
+        self._earlier, self._quick = Counter[str](), dict[str, Program]()  # runs of earlier processes, quick programs
         self._levels = self._levels_now()
         self._programs, self._compile_s = ParallelCompilation(), 0.0
 
     def _levels_now(self) -> dict[str, Level]:
-        return {name: "quick" if self._runs[name] < runs else "full" for name, runs in self._first.items()}
+        done = self._runs + self._earlier
+        return {name: "quick" if done[name] < runs else "full" for name, runs in self._first.items()}
 
     def _run(self, function: Program, *arguments: Any) -> Any:
         self._runs[function.function.__name__] += 1
@@ -80,6 +82,7 @@ class Stepwise(Driver):
         began, setup = time.perf_counter(), self.setup
         with self._programs as compile_programs:
             self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
+        self._earlier = Counter({name: self._programs.earlier_runs(one) for name, one in self._quick.items()})
         state = jax.block_until_ready(setup.initial(self._run))
         self.carry = jax.block_until_ready(self._begin(self._run, state))
         if self.clock.seconds > 0 or self._programs.loaded:
@@ -100,6 +103,11 @@ class Stepwise(Driver):
         self.carry, step, report = self._iterate(self._run, self.carry)
         return _unpack(report, step)
 
+    def end(self) -> None:
+        """See `Driver`."""
+        for name, one in self._quick.items():
+            self._programs.note_runs(one, self._runs[name])
+
     def _begin(self, call: Call, state: LMState) -> Carry:
         """The carry before the first iteration, from the initial state."""
         setup = self.setup
@@ -111,7 +119,14 @@ class Stepwise(Driver):
     def _iterate(self, call: Call, carry: Carry) -> tuple[Carry, StepInfo, Any]:
         """One iteration: the next carry, its record, and the packed report for the host."""
         state, layout, options, policy = carry.state, self.setup.layout, self.setup.options, self.setup.policy
-        part = lambda function: program(function, "options", level=self._levels[function.__name__])
+
+        def part(function: Callable[..., Any]) -> Program:
+            level = self._levels[name := function.__name__]
+            found = program(function, "options", level=level)
+            if level == "quick":
+                self._quick[name] = found
+            return found
+
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(policy.min_gain, state.cost.dtype)
         arguments = (layout, state, carry.damping)

@@ -88,15 +88,21 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     """Sums rows into targets along a summation tree (`sum_trees.sum_tree`).
 
     For fewer kernels the rows of a level are gathered one by one and added if they have one axis, and gathered together
-    and reduced if they have more: each of the two is one kernel there, and many in the other case.
+    and reduced if they have more: each of the two is one kernel there, and many in the other case. XLA would fuse the
+    levels of the second kind into one kernel, which computes what they sum again for each: five levels of Ladybug-49,
+    padded, took 96 ms, and take 2.
     """
     for level in levels:
         if rows.ndim > 2:
-            rows = jnp.sum(take_rows(rows, level), axis=1)
+            rows = compute_unfused(_level_sum, rows, level, index=level)
             continue
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
         rows = functools.reduce(operator.add, parts)
     return rows
+
+
+def _level_sum(rows: Array, level: Array) -> Array:
+    return jnp.sum(take_rows(rows, level), axis=1)
 
 
 UNROLLED_RANKS = 4

@@ -23,7 +23,7 @@ from jax import monitoring
 from jax.experimental.compilation_cache import compilation_cache
 from support import solve
 
-from jaxba import Loss, make_policy, register_pytree
+from jaxba import Loss, Tolerances, make_policy, register_pytree
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
@@ -171,6 +171,25 @@ status = run(sys.argv[1:])
 print("traced", sum(str(name) in ("propose", "try_candidate") for name in names))
 sys.exit(status)
 """
+
+
+def test_programs_that_earlier_solves_ran_often_are_fully_optimised_from_the_start(folder, monkeypatch):
+    """Half of the runs that pay for it in one solve, the other half in the next."""
+    problem = support.tiny()
+    pays = dict.fromkeys(compilation.BREAK_EVEN, 6 * problem.num_observations)
+    monkeypatch.setattr(compilation, "BREAK_EVEN", pays)
+    monkeypatch.setattr(compilation, "TYPICAL", dict.fromkeys(compilation.TYPICAL, 0))
+
+    def quick_iterations() -> int:
+        forget()
+        found = solve(problem, "ceres", max_iterations=4, compilation="auto", tolerances=Tolerances(ftol=0))
+        assert found.iterations == 4
+        return found.quick_iterations
+
+    assert [quick_iterations() for _ in range(3)] == [4, 2, 0]
+    for file in folder.glob(f"*{executable_cache.RUNS}"):
+        file.write_text("damaged")
+    assert quick_iterations() == 4
 
 
 @pytest.mark.slow
@@ -323,7 +342,7 @@ def test_programs_of_both_levels_are_stored(folder, monkeypatch):
     with Compilations() as seen:
         again = once()
     assert not {"propose", "try_step"} & set(seen.names)
-    chex.assert_trees_all_equal(first.history, again.history, strict=True)
+    np.testing.assert_allclose(again.history.cost, first.history.cost, rtol=1e-8)
 
 
 def test_a_missing_folder_is_no_error(tmp_path):
