@@ -73,7 +73,7 @@ def pair_products(
         *sides, sums = parts
         left, right = (take_rows(rows, side).reshape(side.shape[0], -1, width) for side in sides)
         products = compute_unfused(outer_sum, left, right, index=sums)
-        return compute_unfused(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
+        return tree_sum(products, (sums,))
 
     # batch by batch, so that the gathered rows and their products stay in the cache
     partial = loops.map_rows(batch, (pairs.left, pairs.right, pairs.sums), pairs.used).reshape(-1, width * width)

@@ -27,7 +27,7 @@ from jaxba.problem.camera_models import BAL
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.rotations import compose_left, rotation_matrix
 from jaxba.runtime.fusion import compute_unfused, fusion_barrier
-from jaxba.structure.segment_sums import take
+from jaxba.structure.segment_sums import take, take_each
 from jaxba.structure.unknowns import BAL_UNKNOWNS, Unknowns
 from jaxba.typing import AnyArray
 
@@ -41,7 +41,7 @@ class Frames(NamedTuple):
     rotation: Float[Array, "3 3 ..."] | list[list[Array]]  # R, world to camera
     translation: Float[Array, "3 ..."] | list[Array]  # t, scene units
     lens: Float[Array, "numbers ..."] | list[Array]  # f (pixels), k1, k2 of BAL
-    places: tuple[Float[Array, "12 ..."], ...] = ()  # M by rows, and m: from the frame of a rig to the camera, if any
+    places: tuple[Float[Array, "12 ..."] | list[Array], ...] = ()  # M by rows, m: from the frame of a rig to the camera
     which: tuple[Int[Array, "..."], ...] = ()  # position in the models, if there are several
     model: LensModel = BAL_LENS
 
@@ -54,12 +54,14 @@ class Frames(NamedTuple):
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
         rows = [row for place in self.places for row in place]
         table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens, *rows]))
-        # not fused with its uses, in which a gather keeps the compiler from vectorising
-        table = compute_unfused(take, table, jnp.asarray(index), index=index)
+        # not fused with its uses, in which a gather keeps the compiler from vectorising; one by one, since a branch
+        # would copy an array of all
+        table = compute_unfused(take_each, table, jnp.asarray(index), index=index)
         end = len(table) - len(rows)
         places = tuple(table[start : start + 12] for start in range(end, len(table), 12))
         which = tuple(take(one, jnp.asarray(index)) for one in self.which)
-        return Frames(table[:9].reshape(3, 3, -1), table[9:12], table[12:end], places, which, self.model)
+        rotation = [table[k : k + 3] for k in (0, 3, 6)]
+        return Frames(rotation, table[9:12], table[12:end], places, which, self.model)
 
 
 def frames(cameras: Float[Array, "parameters cameras"], unknowns: Unknowns = BAL_UNKNOWNS) -> Frames:

@@ -7,7 +7,7 @@ right for cheap values. The functions here are for the others: they never change
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.typing import AnyArray
+
+Result = TypeVar("Result")
 
 fast_compilation = jax.make_user_context(False)
 """Whether what is traced will be compiled by XLA's older kernel emitters with less optimisation
@@ -36,7 +38,7 @@ def _times_identity(rows: Array) -> Array:
     return jnp.matmul(jnp.eye(rows.shape[0], dtype=rows.dtype), rows, precision="highest")
 
 
-def compute_unfused(function: Callable[..., Array], *operands: Array, index: Int[AnyArray, "..."]) -> Array:
+def compute_unfused(function: Callable[..., Result], *operands: Array, index: Int[AnyArray, "..."]) -> Result:
     """`function(*operands)` in a kernel of its own: XLA fuses it with nothing that comes before or after it.
 
     A kernel that writes its result into a larger array, as the last one in the body of a loop does, runs on one core;
@@ -45,14 +47,13 @@ def compute_unfused(function: Callable[..., Array], *operands: Array, index: Int
     host wait, nothing is done.
 
     Args:
-        function: of arrays, to one array.
+        function: of arrays, to one or several.
         operands: its arguments.
         index: any index array that is an argument of the whole program: nowhere negative, which XLA does not know.
     """
 
-    def never(*operands: Array) -> Array:
-        result = jax.eval_shape(function, *operands)
-        return jnp.zeros(result.shape, result.dtype)
+    def never(*operands: Array) -> Result:
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, *operands))
 
     taken = jnp.reshape(jnp.asarray(index), -1)[0] >= 0
     branch = lambda *operands: lax.cond(taken, function, never, *operands)

@@ -94,7 +94,7 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     """
     for level in levels:
         if rows.ndim > 2:
-            rows = compute_unfused(_level_sum, rows, level, index=level)
+            rows = compute_unfused(_level_sum, rows, jnp.asarray(level), index=level)
             continue
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
         rows = functools.reduce(operator.add, parts)
