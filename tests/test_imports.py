@@ -14,6 +14,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from conftest import LABORATORY
 
 import jaxba
 
@@ -33,9 +34,6 @@ NO_MORE_THAN = {
     "kitti": {"typing", "runtime", "problem", "io"},
 }
 """Rooms that know less than all that stand before them."""
-
-LABORATORY = {"methods", "kitti", "game", "training", "peers", "bench", "paper"}
-"""Rooms that ask rather than solve. The library, which is all else, imports nothing of them."""
 
 LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper", "tune")}
 """Modules of commands that belong to them."""

@@ -89,8 +89,8 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
 
     For fewer kernels the rows of a level are gathered one by one and added if they have one axis, and gathered together
     and reduced if they have more: each of the two is one kernel there, and many in the other case. XLA would fuse the
-    levels of the second kind into one kernel, which computes what they sum again for each: five levels of Ladybug-49,
-    padded, took 96 ms, and take 2.
+    levels of the second kind into one kernel, which computes what they sum again for each: 96 instead of 2 ms for the
+    five levels of Ladybug-49, padded.
     """
     for level in levels:
         if rows.ndim > 2:
