@@ -50,8 +50,9 @@ from jaxba.results.covariance import Covariance, covariance
 from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
 from jaxba.results.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
-from jaxba.solver.iteration import Carry, solve_loop
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
+from jaxba.solver.iteration import Carry
+from jaxba.solver.loop import solve_loop
 from jaxba.solver.methods import METHODS, make_method
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare

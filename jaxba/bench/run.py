@@ -25,7 +25,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory, threads
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_solver
 from jaxba.solver.options import MAX_ITERATIONS, SolveOptions

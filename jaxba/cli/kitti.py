@@ -28,7 +28,7 @@ from jaxba.kitti.assemble import Frames, windows
 from jaxba.kitti.calibration import calibration_files
 from jaxba.kitti.options import Build
 from jaxba.kitti.sequence import read_sequence
-from jaxba.kitti.trajectory import path_length
+from jaxba.kitti.trajectory_errors import path_length
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text

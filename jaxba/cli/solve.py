@@ -44,7 +44,7 @@ from jaxba.results.covariance import covariance
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
 from jaxba.scenes import DEFAULT_SCENES, random_scene
-from jaxba.solver.loop import IterationRecord, Watch
+from jaxba.solver.drivers import IterationRecord, Watch
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import Repairs, SolverName, adjusted, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions

@@ -18,7 +18,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK
 from jaxba.results.retriangulate import Retriangulation
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
 from jaxba.solver.solve import Solution

@@ -17,7 +17,7 @@ from jaxba.cli import common
 from jaxba.cli.options import options
 
 if TYPE_CHECKING:
-    from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.page import Viewer
 
 VIEWER = "jaxba.viewer.extra"
 """Module that needs viser."""
@@ -69,12 +69,12 @@ def _run(args: Arguments) -> int:
     with common.notes_printed():
         shown = sources.open_all(args.files, args.images)
     if args.html:
-        from jaxba.viewer.page import write_page
+        from jaxba.viewer.page_file import write_page
 
         write_page(shown, args.html)
         common.print_line(f"wrote {args.html} ({os.path.getsize(args.html) / 1e6:.1f} MB)")
         return 0
-    from jaxba.viewer.panel import Viewer, heading, worst_images
+    from jaxba.viewer.page import Viewer, heading, worst_images
 
     viewer = Viewer(shown, args.port, args.host)
     for stage in viewer.stages:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaxba.cli import common, view
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.solver.loop import IterationRecord, Watch
+from jaxba.solver.drivers import IterationRecord, Watch
 
 PAUSE_S = 0.3
 """Least time between two updates of the page."""
@@ -35,7 +35,7 @@ def watched(
 
     recorder, drawn, viewer = Recorder(problem, path or ""), 0.0, None
     if show:
-        from jaxba.viewer.panel import Viewer
+        from jaxba.viewer.page import Viewer
         from jaxba.viewer.sources import shown
 
         viewer = Viewer([shown(recorder.recording(), Path(path).name if path else "random scene")])

@@ -13,8 +13,8 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.default_policy import FIRST_DAMPING, finite_gain, times_shortened
 from jaxba.damping.guard import GuardState, initial_guard, update_guard
-from jaxba.damping.guarded import FIRST_DAMPING, finite_gain, times_shortened
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 

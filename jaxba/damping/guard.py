@@ -22,7 +22,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.guarded import Rescue, is_inexact, smallest_decades, times_shortened
+from jaxba.damping.default_policy import Rescue, is_inexact, smallest_decades, times_shortened
 from jaxba.damping.rules import LARGEST
 from jaxba.lm.records import StepInfo
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from jaxba.damping.agent_config import embedded
-from jaxba.damping.guarded import Guarded
+from jaxba.damping.default_policy import Guarded
 from jaxba.damping.learned import ConstantAction, boldest
 from jaxba.damping.policy import DampingPolicy
 from jaxba.damping.policy_file import load_policy

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxba.io import read_problem
 from jaxba.io.files import StrPath, display_name, open_output, strip_compression
 from jaxba.io.frames import Sidecar
-from jaxba.kitti import trajectory
+from jaxba.kitti import trajectory_errors
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.similarity import Similarity, umeyama
@@ -22,20 +22,20 @@ from jaxba.problem.similarity import Similarity, umeyama
 def score(
     poses: Float[np.ndarray, "cameras 3 4"],
     truth: Float[np.ndarray, "cameras 3 4"],
-    lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
+    lengths: tuple[float, ...] = trajectory_errors.DEVKIT_LENGTHS,
 ) -> dict[str, Any]:
-    """All errors of a trajectory after its alignment, in metres and degrees; see `trajectory`.
+    """All errors of a trajectory after its alignment, in metres and degrees; see `trajectory_errors`.
 
     Raises:
         ProblemError: it cannot be aligned.
     """
     similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
     aligned = similarity.poses(poses)
-    translation, rotation = trajectory.relative_errors(aligned, truth)
-    segments = trajectory.segment_errors(aligned, truth, lengths)
+    translation, rotation = trajectory_errors.relative_errors(aligned, truth)
+    segments = trajectory_errors.segment_errors(aligned, truth, lengths)
     return {
         "scale": similarity.scale,  # metres per unit of the trajectory
-        "ate_m": trajectory.absolute_errors(aligned, truth)._asdict(),
+        "ate_m": trajectory_errors.absolute_errors(aligned, truth)._asdict(),
         "rpe_translation_m": translation._asdict(),
         "rpe_rotation_deg": rotation._asdict(),
         "segments": segments and segments._asdict(),
@@ -46,7 +46,7 @@ def evaluate(
     paths: Sequence[StrPath],
     side: Sidecar,
     truth: Float[np.ndarray, "cameras 3 4"] | None,
-    lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
+    lengths: tuple[float, ...] = trajectory_errors.DEVKIT_LENGTHS,
 ) -> list[tuple[dict[str, Any], Float[np.ndarray, "cameras 3 4"], Float[np.ndarray, "points 3"]]]:
     """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
 

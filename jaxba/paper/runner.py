@@ -27,7 +27,7 @@ from jaxba.peers import require
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.names import PEERS, SolverName, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.record import Record

@@ -21,7 +21,7 @@ from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solver.diagnosis import explain_start
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.names import INNER
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution

@@ -17,7 +17,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import set_aside
 from jaxba.results.retriangulate import Retriangulation, retriangulate_without
 from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.loop import Callback, IterationRecord, Watch
+from jaxba.solver.drivers import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve_without

@@ -1,6 +1,6 @@
-"""One iteration of a solve: an LM step, the policy's next lambda, the stopping rules; and the loop as one program.
+"""One iteration of a solve: an LM step, the policy's next lambda, the stopping rules.
 
-`solve` repeats it as one program (`solve_loop`), from Python (stepwise.py) or on several devices (sharded.py); the game
+`solve` repeats it as one program (loop.py), from Python (stepwise.py) or on several devices (sharded.py); the game
 repeats it for many scenes at once.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy, ProblemInfo
@@ -21,12 +21,9 @@ from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, only_free
 from jaxba.problem.options import StepOptions
-from jaxba.runtime.jit import jit
-from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
-from jaxba.typing import AnyArray
 
 
 class Carry(NamedTuple):
@@ -104,63 +101,6 @@ def iterate(
     options: StepOptions,
     limit: Any,
 ) -> tuple[Carry, StepInfo]:
-    """The carry after one iteration, and its record. Arguments as for `solve_loop`."""
+    """The carry after one iteration, and its record. Arguments as for `loop.solve_loop`."""
     state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration)
     return advance(carry, state, step, policy, tolerances, limit, num_partitions(layout)), step
-
-
-@for_traces
-@functools.partial(jit, static_argnames=("options", "max_iterations"))
-def solve_loop(
-    layout: Layout,
-    state: LMState,
-    policy: DampingPolicy,
-    tolerances: Tolerances,
-    options: StepOptions,
-    max_iterations: int,
-    limit: Int[AnyArray, ""] | None = None,
-) -> tuple[Carry, StepInfo]:
-    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
-
-    Args:
-        layout: the problem's observations.
-        state: start.
-        policy: chooses lambda.
-        tolerances: convergence tests.
-        options: static options of the step.
-        max_iterations: length of the record, static.
-        limit: a lower limit of iterations, not static.
-
-    Returns:
-        Final carry, and the record: arrays of length `max_iterations`, zero after the last iteration.
-
-    Raises:
-        ValueError: the state is float64, and 64 bits are not enabled in JAX.
-    """
-    check_x64(state.cost.dtype)
-    iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
-    carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
-    return loop_from(layout, carry, policy, tolerances, options, max_iterations, iteration_limit)
-
-
-def loop_from(
-    layout: Layout,
-    carry: Carry,
-    policy: DampingPolicy,
-    tolerances: Tolerances,
-    options: StepOptions,
-    length: int,
-    limit: Any,
-) -> tuple[Carry, StepInfo]:
-    """The loop from a carry to its end; the record has the given length. Other arguments as for `solve_loop`."""
-    once = lambda carry: iterate(layout, carry, policy, tolerances, options, limit)
-    shapes = jax.eval_shape(once, carry)[1]
-    empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
-
-    def body(loop: tuple[Carry, StepInfo]) -> tuple[Carry, StepInfo]:
-        before, history = loop
-        after, step = once(before)
-        history = jax.tree.map(lambda all_, one: all_.at[before.iteration].set(one), history, step)
-        return after, history
-
-    return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

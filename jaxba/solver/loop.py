@@ -1,113 +1,78 @@
-"""Who runs the iterations of a solve, and what they show of each: one compiled program, on one device or several.
-
-The third way, from Python, is stepwise.py.
-"""
+"""The iterations of a solve as one loop of a compiled program."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import functools
+from typing import Any
 
 import jax
-import numpy as np
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Int
 
+from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.runtime.compilation import CompileClock, compile_and_run
-from jaxba.solver.iteration import Carry, solve_loop
-from jaxba.solver.prepare import Setup
-from jaxba.solver.sharded import Shards
+from jaxba.problem.options import StepOptions
+from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import check_x64, for_traces
+from jaxba.solver.iteration import Carry, begin, iterate, problem_info
+from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
 
 
-class IterationRecord(NamedTuple):
-    """The argument of a callback."""
+@for_traces
+@functools.partial(jit, static_argnames=("options", "max_iterations"))
+def solve_loop(
+    layout: Layout,
+    state: LMState,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    options: StepOptions,
+    max_iterations: int,
+    limit: Int[AnyArray, ""] | None = None,
+) -> tuple[Carry, StepInfo]:
+    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
 
-    iteration: int
-    """Number of the iteration, from 1."""
+    Args:
+        layout: the problem's observations.
+        state: start.
+        policy: chooses lambda.
+        tolerances: convergence tests.
+        options: static options of the step.
+        max_iterations: length of the record, static.
+        limit: a lower limit of iterations, not static.
 
-    time_s: float
-    """Seconds since the start of the first iteration, without compilation."""
+    Returns:
+        Final carry, and the record: arrays of length `max_iterations`, zero after the last iteration.
 
-    step: StepInfo
-    """Record of the iteration, as Python scalars."""
-
-
-Callback = Callable[[IterationRecord], bool | None]
-"""Gets the record of an iteration; a true return value ends the solve."""
-
-Watch = Callable[[IterationRecord, Callable[[], BundleProblem]], None]
-"""Gets the record of an iteration, and a function that gives the problem with the parameters after it."""
-
-
-MIN_LENGTH = 128
-"""Smallest length of the record of a compiled loop, so that all lower limits use one program; larger limits are
-rounded up to a power of two."""
-
-
-class Driver:
-    """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives the state at the
-    start, and `finish`, which runs all iterations as one program, or `iterate`, which runs one, or both."""
-
-    carry: Carry
-    """The state of the loop; from `begin`, or `finish`, on."""
-
-    quick_iterations = 0
-    """Iterations in which some program was not fully optimised."""
-
-    def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
-        self.setup, self.tolerances, self.clock = setup, tolerances, clock
-        self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
-        self.length = max(MIN_LENGTH, 1 << int(self.limit - 1).bit_length())
-
-    def compile_s(self) -> float:
-        """Seconds of compilation so far."""
-        return self.clock.seconds
-
-    def end(self) -> None:
-        """After the last iteration: notes what later solves should know."""
-
-    def _ended(self, found: tuple[Carry, StepInfo]) -> tuple[StepInfo, Termination]:
-        """The records of all iterations as one, and why the solve ended."""
-        self.carry, columns = jax.block_until_ready(found)
-        count = int(self.carry.iteration)
-        steps = jax.tree.map(lambda column: np.asarray(column)[:count], columns)
-        return steps, Termination(int(self.carry.termination))
+    Raises:
+        ValueError: the state is float64, and 64 bits are not enabled in JAX.
+    """
+    check_x64(state.cost.dtype)
+    iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
+    carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
+    return loop_from(layout, carry, policy, tolerances, options, max_iterations, iteration_limit)
 
 
-class Compiled(Driver):
-    """All iterations as one program on one device."""
+def loop_from(
+    layout: Layout,
+    carry: Carry,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    options: StepOptions,
+    length: int,
+    limit: Any,
+) -> tuple[Carry, StepInfo]:
+    """The loop from a carry to its end; the record has the given length. Other arguments as for `solve_loop`."""
+    once = lambda carry: iterate(layout, carry, policy, tolerances, options, limit)
+    shapes = jax.eval_shape(once, carry)[1]
+    empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
 
-    def begin(self) -> LMState:
-        """The state at the start."""
-        self._start = jax.block_until_ready(self.setup.initial(compile_and_run))
-        return self._start
+    def body(loop: tuple[Carry, StepInfo]) -> tuple[Carry, StepInfo]:
+        before, history = loop
+        after, step = once(before)
+        history = jax.tree.map(lambda all_, one: all_.at[before.iteration].set(one), history, step)
+        return after, history
 
-    def finish(self) -> tuple[StepInfo, Termination]:
-        """Runs to the end; the records of all iterations as one, and why it ended."""
-        setup = self.setup
-        options = setup.policy, self.tolerances, setup.options, self.length, self.limit
-        return self._ended(solve_loop(setup.layout, self._start, *options))
-
-
-class OnDevices(Driver):
-    """Several devices, all iterations as one program or one at a time."""
-
-    def __init__(self, shards: Shards, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._shards = shards
-
-    def begin(self) -> LMState:
-        """The state at the start."""
-        self.carry = self._shards.begin(self.setup.policy, self.limit)
-        return jax.block_until_ready(self.carry.state)
-
-    def finish(self) -> tuple[StepInfo, Termination]:
-        """See `Compiled`."""
-        return self._ended(self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length))
-
-    def iterate(self) -> tuple[StepInfo, Termination]:
-        """One iteration: its record, of Python scalars, and whether it ended the solve."""
-        self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
-        step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
-        return step, Termination(int(self.carry.termination))
+    return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

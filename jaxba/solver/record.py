@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxba.runtime.process import threads
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.names import SolverName
 from jaxba.solver.solve import Solution
 

@@ -31,7 +31,8 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.jit import jit
-from jaxba.solver.iteration import Carry, begin, iterate, loop_from, problem_info
+from jaxba.solver.iteration import Carry, begin, iterate, problem_info
+from jaxba.solver.loop import loop_from
 from jaxba.structure.agreement import Agreement, merged, same
 from jaxba.structure.devices import AXIS
 from jaxba.structure.layout import Layout, build_layout

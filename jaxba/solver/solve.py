@@ -18,7 +18,7 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import cost_of_rounding
-from jaxba.solver.loop import Callback, Compiled, IterationRecord, OnDevices, Watch
+from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.stepwise import Stepwise, quick_runs_of

@@ -38,8 +38,8 @@ from jaxba.runtime.compilation import (
     program,
     quick_runs,
 )
+from jaxba.solver.drivers import Driver
 from jaxba.solver.iteration import Carry, advance, begin, problem_info
-from jaxba.solver.loop import Driver
 from jaxba.structure.layout import Layout, num_partitions
 
 Call = Callable[..., Any]

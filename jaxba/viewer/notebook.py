@@ -21,7 +21,7 @@ def view(what: BundleProblem | Solution, *, port: int = 8080) -> Any:
     Raises:
         ImportError: viser is not installed: pip install jaxba[view].
     """
-    from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.page import Viewer
     from jaxba.viewer.sources import shown
 
     is_solution = isinstance(what, Solution)

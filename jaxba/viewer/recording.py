@@ -20,7 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import Labels
-from jaxba.solver.loop import IterationRecord
+from jaxba.solver.drivers import IterationRecord
 
 RECORDED_POINTS = 20_000
 """Most points of a recording: a hundred iterations take some 20 MB."""

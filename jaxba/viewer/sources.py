@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_problem
-from jaxba.io.colmap.problem import Looks, read_colmap_with_looks
+from jaxba.io.colmap.read import Looks, read_colmap_with_looks
 from jaxba.io.files import StrPath, display_name, sidecar_path
 from jaxba.io.frames import Sidecar, read_sidecar
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

@@ -14,8 +14,8 @@ from support import step_info
 
 from jaxba import Ceres
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.default_policy import FIRST_DAMPING
 from jaxba.damping.guard import OVERDAMPED_DECREASE, OVERDAMPED_FRACTION
-from jaxba.damping.guarded import FIRST_DAMPING
 from jaxba.game.env import _rule_damping
 
 

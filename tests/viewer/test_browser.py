@@ -68,7 +68,7 @@ def recording():
 
 @pytest.fixture
 def viewer(recording, browser):
-    from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.page import Viewer
     from jaxba.viewer.sources import shown
 
     with socket.socket() as free:
@@ -198,7 +198,7 @@ def test_a_click_on_a_frustum_marks_its_points(browser, viewer):
 
 
 def test_a_page_in_a_file_plays_without_a_server(browser, recording, tmp_path):
-    from jaxba.viewer.page import write_page
+    from jaxba.viewer.page_file import write_page
     from jaxba.viewer.sources import shown
 
     path = tmp_path / "run.html"
@@ -229,7 +229,7 @@ def test_a_solve_is_watched_while_it_runs(browser, viewer, recording):
 def test_slider_and_curve_come_with_the_first_iteration(recording):
     from dataclasses import replace
 
-    from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.page import Viewer
     from jaxba.viewer.sources import shown
 
     rows = ("state", "cost", "damping", "gain_ratio", "time_s")
@@ -254,6 +254,6 @@ def test_the_command_says_what_is_missing(tmp_path, capsys):
 
 
 def test_names_are_characters_and_nothing_else():
-    from jaxba.viewer.panel import plain
+    from jaxba.viewer.page import plain
 
     assert plain("<b>*a*_1") == r"&lt;b&gt;\*a\*\_1"

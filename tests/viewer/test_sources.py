@@ -7,7 +7,7 @@ import pytest
 
 import jaxba
 from jaxba.cli import solve, view
-from jaxba.io.colmap.problem import read_colmap_with_looks
+from jaxba.io.colmap.read import read_colmap_with_looks
 from jaxba.viewer.sources import open_all
 
 

@@ -12,7 +12,7 @@ from jaxba.io.colmap.files import has_parts, read_model, write_model
 from jaxba.io.colmap.lenses import with_lens
 from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model, Rig, Sensor
 from jaxba.io.colmap.poses import colmap_poses, composed, inverse
-from jaxba.io.colmap.problem import Assembled, assemble, place_in_rig
+from jaxba.io.colmap.read import Assembled, assemble, place_in_rig
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import numbered
 from jaxba.problem import geometry

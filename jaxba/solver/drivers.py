@@ -1,0 +1,114 @@
+"""Who runs the iterations of a solve, and what they show of each: one compiled program, on one device or several.
+
+The third way, from Python, is stepwise.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.termination import Termination, Tolerances
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.runtime.compilation import CompileClock, compile_and_run
+from jaxba.solver.iteration import Carry
+from jaxba.solver.loop import solve_loop
+from jaxba.solver.prepare import Setup
+from jaxba.solver.sharded import Shards
+
+
+class IterationRecord(NamedTuple):
+    """The argument of a callback."""
+
+    iteration: int
+    """Number of the iteration, from 1."""
+
+    time_s: float
+    """Seconds since the start of the first iteration, without compilation."""
+
+    step: StepInfo
+    """Record of the iteration, as Python scalars."""
+
+
+Callback = Callable[[IterationRecord], bool | None]
+"""Gets the record of an iteration; a true return value ends the solve."""
+
+Watch = Callable[[IterationRecord, Callable[[], BundleProblem]], None]
+"""Gets the record of an iteration, and a function that gives the problem with the parameters after it."""
+
+
+MIN_LENGTH = 128
+"""Smallest length of the record of a compiled loop, so that all lower limits use one program; larger limits are
+rounded up to a power of two."""
+
+
+class Driver:
+    """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives the state at the
+    start, and `finish`, which runs all iterations as one program, or `iterate`, which runs one, or both."""
+
+    carry: Carry
+    """The state of the loop; from `begin`, or `finish`, on."""
+
+    quick_iterations = 0
+    """Iterations in which some program was not fully optimised."""
+
+    def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
+        self.setup, self.tolerances, self.clock = setup, tolerances, clock
+        self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
+        self.length = max(MIN_LENGTH, 1 << int(self.limit - 1).bit_length())
+
+    def compile_s(self) -> float:
+        """Seconds of compilation so far."""
+        return self.clock.seconds
+
+    def end(self) -> None:
+        """After the last iteration: notes what later solves should know."""
+
+    def _ended(self, found: tuple[Carry, StepInfo]) -> tuple[StepInfo, Termination]:
+        """The records of all iterations as one, and why the solve ended."""
+        self.carry, columns = jax.block_until_ready(found)
+        count = int(self.carry.iteration)
+        steps = jax.tree.map(lambda column: np.asarray(column)[:count], columns)
+        return steps, Termination(int(self.carry.termination))
+
+
+class Compiled(Driver):
+    """All iterations as one program on one device."""
+
+    def begin(self) -> LMState:
+        """The state at the start."""
+        self._start = jax.block_until_ready(self.setup.initial(compile_and_run))
+        return self._start
+
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """Runs to the end; the records of all iterations as one, and why it ended."""
+        setup = self.setup
+        options = setup.policy, self.tolerances, setup.options, self.length, self.limit
+        return self._ended(solve_loop(setup.layout, self._start, *options))
+
+
+class OnDevices(Driver):
+    """Several devices, all iterations as one program or one at a time."""
+
+    def __init__(self, shards: Shards, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._shards = shards
+
+    def begin(self) -> LMState:
+        """The state at the start."""
+        self.carry = self._shards.begin(self.setup.policy, self.limit)
+        return jax.block_until_ready(self.carry.state)
+
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """See `Compiled`."""
+        return self._ended(self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length))
+
+    def iterate(self) -> tuple[StepInfo, Termination]:
+        """One iteration: its record, of Python scalars, and whether it ended the solve."""
+        self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
+        step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
+        return step, Termination(int(self.carry.termination))
