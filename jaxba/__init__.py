@@ -38,7 +38,7 @@ from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.camera_models import CAMERA_MODELS, CameraModel, register_camera_model
 from jaxba.problem.constants import Constants
-from jaxba.problem.constraints import hold, release, with_gauge
+from jaxba.problem.hold import hold, release, with_gauge
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors

@@ -14,7 +14,7 @@ from jaxba.cli.constraint_values import names_of, parse_items, parse_position_pr
 from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
-from jaxba.problem.constraints import Gauge, hold, with_gauge
+from jaxba.problem.hold import Gauge, hold, with_gauge
 from jaxba.problem.labels import part_name
 from jaxba.problem.measured import with_position_priors
 from jaxba.settings.configurations import SettingsError, read_file

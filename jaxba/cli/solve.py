@@ -28,8 +28,8 @@ from jaxba.io import is_colmap, read_colmap, read_problem
 from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.constraints import Gauge, hold
 from jaxba.problem.facing import aside_text, facing_away
+from jaxba.problem.hold import Gauge, hold
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
     ConjugateGradients,

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxba.problem.alignment import aligned
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.checks import finite, inverse_roots, shown
-from jaxba.problem.constraints import every_lens, number_columns, positions_of
+from jaxba.problem.hold import every_lens, number_columns, positions_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
 

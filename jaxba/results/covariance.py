@@ -27,9 +27,9 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
-from jaxba.problem.constraints import every_lens
 from jaxba.problem.facing import facing_away
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
+from jaxba.problem.hold import every_lens
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.labels import Part, part_names
 from jaxba.problem.losses import Loss

@@ -17,8 +17,8 @@ from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import numbered
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.constraints import every_lens
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
+from jaxba.problem.hold import every_lens
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import part_name
 
