@@ -44,7 +44,9 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
+from jaxba.problem.residuals import residual
 from jaxba.problem.rigs import Rigs
+from jaxba.residuals.register import with_residual
 from jaxba.results.alternation import solve_and_retriangulate
 from jaxba.results.covariance import Covariance, covariance
 from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
@@ -140,6 +142,7 @@ __all__ = [
     "register_camera_model",
     "register_pytree",
     "release",
+    "residual",
     "retriangulate",
     "save_policy",
     "scene_like",
@@ -152,6 +155,7 @@ __all__ = [
     "with_gauge",
     "with_lens_priors",
     "with_position_priors",
+    "with_residual",
     "with_rotation_priors",
     "write_bal",
     "write_bundler",

@@ -30,7 +30,7 @@ FLOAT32_SHIFT = 64.0
 
 def in_full(layout: Layout) -> bool:
     """Whether the system is factored in float64 also if mixed precision is asked for: it is small, or has frames."""
-    return layout.unknowns.poses.several or _by_woodbury(layout)
+    return layout.unknowns.merged or _by_woodbury(layout)
 
 
 def factored(system: DampedSystem, *, rough: bool = False) -> Solve:
@@ -47,7 +47,7 @@ def factored(system: DampedSystem, *, rough: bool = False) -> Solve:
     if layout.grid is not None:
         return _merged(unknowns, dense_system(system), rough)
     pairs, blocks = layout.part("pairs"), reduced_blocks(system)
-    if unknowns.poses.several:
+    if unknowns.merged:
         return _merged(unknowns, dense_blocks(pairs, blocks), rough)
     kept = without_lenses(unknowns, pairs, blocks)
     if pairs.band is None:

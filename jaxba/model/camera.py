@@ -158,7 +158,9 @@ def derivatives(
         by_number += [lambda pair=pair: pair for pair in zip(*by_extrinsics, strict=True)]
         rows = [[a * place[k] + b * place[3 + k] + c * place[6 + k] for k in range(3)] for a, b, c in rows]
     columns = range(len(by_number)) if columns is None else columns
-    numbers = list(zip(*(by_number[k]() for k in columns), strict=True)) or [(), ()]
+    zero = jnp.zeros_like(projection.radius)
+    of_number = lambda k: by_number[k]() if k < len(by_number) else (zero, zero)  # of a block of residuals
+    numbers = list(zip(*map(of_number, columns), strict=True)) or [(), ()]
     camera = [[*_by_rotation(row, projection.rotated), *row, *own] for row, own in zip(rows, numbers, strict=True)]
     rotation = frame.rotation
     point = [[a * rotation[0][k] + b * rotation[1][k] + c * rotation[2][k] for k in range(3)] for a, b, c in rows]

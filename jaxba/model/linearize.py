@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
 from jaxba.model.priors import PriorTerms, costs_of, prior_terms
+from jaxba.model.residuals import add_costs, linearized
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
 from jaxba.problem.safe_math import safe_sqrt
@@ -73,7 +74,7 @@ def observation_costs(
 ) -> Float[Array, " slots"]:
     """`slot_costs` at the given parameters; zero in empty slots."""
     terms = lambda views: [slot_costs(loss, view_residuals(views, views.projected()))]
-    return view_terms(layout, slot_frames(layout, cameras), points, terms)[0]
+    return add_costs(layout, cameras, points, view_terms(layout, slot_frames(layout, cameras), points, terms)[0])
 
 
 def cost(
@@ -135,6 +136,11 @@ def linearize(
         return [*rows, costs, projection.inverse_depth]
 
     *rows, costs, inverse_depth = view_terms(layout, slot_frames(layout, cameras), points, terms)
+    costs = add_costs(layout, cameras, points, costs)
+    for own in layout.residuals:
+        found = linearized(own, unknowns, cameras, points)
+        added = [*found.residual, *found.by_camera[0], *found.by_camera[1], *found.by_point[0], *found.by_point[1]]
+        rows = [row.at[found.at].add(one, mode="drop") for row, one in zip(rows, added, strict=True)]
     residual, rows = rows[:2], rows[2:]
     width = (len(rows) - 6) // 2
     by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]

@@ -17,6 +17,7 @@ from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
 from jaxba.problem.priors import Priors, checked_priors
+from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import Rigs, checked_rigs
 from jaxba.typing import AnyArray, ArrayRecord, InputError, register_pytree
 
@@ -82,6 +83,9 @@ class BundleProblem(ArrayRecord):
 
     priors: Priors | None = None
     """What is known of cameras besides the pixels; None: nothing."""
+
+    residuals: Residuals | None = None
+    """Residuals of one's own (`jaxba.with_residual`); None: there are those of pixels and priors alone."""
 
     labels: Labels | None = field(default=None, metadata={"host": True})
     """What the file calls images, lenses and points; None if nothing does."""
@@ -156,7 +160,7 @@ class BundleProblem(ArrayRecord):
     def __repr__(self) -> str:
         arrays = ("cameras", "points", "observations")
         counts = [f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays]
-        parts = ("whitening", "lenses", "constants", "rigs", "priors", "labels")
+        parts = ("whitening", "lenses", "constants", "rigs", "priors", "residuals", "labels")
         return f"BundleProblem({', '.join([*counts, *(name for name in parts if getattr(self, name) is not None)])})"
 
     @property
@@ -189,7 +193,8 @@ class BundleProblem(ArrayRecord):
         Args:
             observations: a mask or positions; they name no other cameras and points than those that stay.
             cameras: positions, ascending; None: all. Lenses and frames keep their numbers, priors are left out.
-            points: positions, ascending; None: all. With these or cameras there are no labels.
+            points: positions, ascending; None: all. With these or cameras there are no labels, and no residuals of
+                one's own but in a problem that is laid out (structure/residual_slots.py).
         """
         names = ("observations", "camera_index", "point_index", "whitening")
         arrays = {name: getattr(self, name) for name in names}
@@ -200,6 +205,8 @@ class BundleProblem(ArrayRecord):
         if points is not None:
             index = np.searchsorted(points, found.point_index).astype(np.int32)
             found = replace(found, points=np.asarray(self.points)[points], point_index=index, labels=None)
+            if self.residuals is not None:
+                found = replace(found, residuals=self.residuals.of(np.asarray(observations), points))
         if cameras is None:
             return found
         return replace(
@@ -209,6 +216,7 @@ class BundleProblem(ArrayRecord):
             lenses=None if self.lenses is None else self.lenses.of(cameras),
             rigs=None if self.rigs is None else self.rigs.of(cameras),
             priors=None,
+            residuals=None,
             labels=None,
         )
 

@@ -57,7 +57,8 @@ def transformed(
         whitening = np.asarray(priors.position_whitening) / scale
         priors = replace(priors, positions=by.points(np.asarray(priors.positions)), position_whitening=whitening)
     rigs = rigs if rigs is None or scale == 1.0 else rigs.scaled(scale)
-    return problem.replace(cameras=cameras, points=points, rigs=rigs, priors=priors)
+    residuals = None if problem.residuals is None else problem.residuals.moved(*by)
+    return problem.replace(cameras=cameras, points=points, rigs=rigs, priors=priors, residuals=residuals)
 
 
 def umeyama(

@@ -166,7 +166,7 @@ def _refined(
     of_priors = prior_costs(layout, cameras)
     if not refinement.points:
         return points, jnp.concatenate([observation_costs(layout, cameras, points, loss), *of_priors])
-    arguments = layout, slot_frames(layout, cameras), points, loss, refinement.points, against.previous
+    arguments = layout, cameras, slot_frames(layout, cameras), points, loss, refinement.points, against.previous
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * predicted)
     if refinement.starts == "step":
         points, costs = refine_points(*arguments, min_decrease)

@@ -16,6 +16,7 @@ from jaxba.linear.cholesky3 import cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import slot_costs, view_residuals
 from jaxba.model.observations import Views, point_passes
+from jaxba.model.residuals import add_point_terms
 from jaxba.problem.losses import Loss
 from jaxba.refinement.points import PreviousPoints, has_receded, refine_points
 from jaxba.runtime import loops
@@ -68,7 +69,12 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
 
 
 def choose_starts(
-    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], loss: Loss, previous: PreviousPoints
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    frames: camera.Frames,
+    points: Float[Array, "3 points"],
+    loss: Loss,
+    previous: PreviousPoints,
 ) -> Float[Array, "2 3 points"]:
     """Two starts for every point: its position after the step and the midpoint of its rays.
 
@@ -93,6 +99,7 @@ def choose_starts(
     own, own_lost, own_inverse_depth, costs, lost, other_inverse_depth = point_passes(layout, frames)(
         points, terms, previous.front, *middle_at_slot
     )
+    own, costs = (add_point_terms(layout, cameras, at, [sums])[0] for at, sums in ((points, own), (middle, costs)))
     diverged = (own_lost > 0) | has_receded(own_inverse_depth, previous.inverse_depth_sum)
     possible = (lost == 0) & ~has_receded(other_inverse_depth, previous.inverse_depth_sum) & jnp.isfinite(costs)
     possible = layout.unknowns.free_points.where(possible, False)
@@ -102,6 +109,7 @@ def choose_starts(
 
 def refine_from_starts(
     layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
     frames: camera.Frames,
     points: Float[Array, "3 points"],
     loss: Loss,
@@ -116,7 +124,8 @@ def refine_from_starts(
 
     Args:
         layout: the problem's observations.
-        frames: camera of every slot after the step.
+        cameras: cameras after the step.
+        frames: camera of every slot, of these.
         points: points after the step.
         loss: robust loss.
         iterations: iterations per point and start.
@@ -127,11 +136,14 @@ def refine_from_starts(
     Returns:
         As `refine_points`.
     """
-    choose = lambda frames, points, previous: choose_starts(layout, frames, points, loss, previous)
-    candidates = loops.run_if(starts > 0, choose, (frames, points, previous), jnp.stack([points, points]))
+    choose = lambda *given: choose_starts(layout, *given[:3], loss, given[3])
+    given = cameras, frames, points, previous
+    candidates = loops.run_if(starts > 0, choose, given, jnp.stack([points, points]))
 
     def refine_start(number: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-        found, costs = refine_points(layout, frames, candidates[number], loss, iterations, previous, min_decrease)
+        found, costs = refine_points(
+            layout, cameras, frames, candidates[number], loss, iterations, previous, min_decrease
+        )
         lower = costs < best[1]
         return jnp.where(lower, found, best[0]), jnp.where(lower, costs, best[1])
 

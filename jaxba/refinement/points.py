@@ -29,6 +29,7 @@ from jaxba.linear.cholesky3 import cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import Reference, point_terms
 from jaxba.model.observations import Views, point_passes
+from jaxba.model.residuals import add_point_terms
 from jaxba.problem.losses import Loss
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_in_one_loop
@@ -98,6 +99,7 @@ class _Search(NamedTuple):
 
 def refine_points(
     layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
     frames: camera.Frames,
     points: Float[Array, "3 points"],
     loss: Loss,
@@ -109,6 +111,7 @@ def refine_points(
 
     Args:
         layout: the problem's observations.
+        cameras: cameras, held fixed.
         frames: camera of every slot (`linearize.slot_frames`).
         points: start.
         loss: robust loss.
@@ -131,7 +134,8 @@ def refine_points(
         return [*found, (front & (found[-1] > 0)).astype(points.dtype)]
 
     def next_pass(now: _Search) -> _Search:
-        *system, costs, inverse_depth_sum, lost = one_pass(now.trial, terms, before.front)
+        *found, inverse_depth_sum, lost = one_pass(now.trial, terms, before.front)
+        *system, costs = add_point_terms(layout, cameras, now.trial, found)
         diverged = (now.passes == 0) & ((lost > 0) | has_receded(inverse_depth_sum, before.inverse_depth_sum))
         delayed = now.delayed | diverged
         start = jnp.where(jnp.isinf(now.costs), inverse_depth_sum, now.inverse_depth_sum)

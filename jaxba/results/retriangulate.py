@@ -142,7 +142,7 @@ def _search(
 
     def try_start(best: tuple[Array, Array], position: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
-        trial, _ = refine_points(layout, frames, position, loss, POINT_ITERATIONS)
+        trial, _ = refine_points(layout, state.cameras, frames, position, loss, POINT_ITERATIONS)
         trial_costs, lost = one_pass(trial, terms)
         better = (trial_costs < costs) & (lost <= hidden)
         return (jnp.where(better, trial, points), jnp.where(better, trial_costs, costs)), None

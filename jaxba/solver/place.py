@@ -20,6 +20,7 @@ from jaxba.problem.rigs import with_unseen_of_frames
 from jaxba.runtime import process
 from jaxba.runtime.numerics import refuse_traces
 from jaxba.structure.layout import Layout
+from jaxba.structure.residual_slots import laid_out, with_block_values
 from jaxba.typing import AnyArray
 
 NO_CAMERAS = np.zeros(0, int)
@@ -36,7 +37,7 @@ class Placed(NamedTuple):
     """The middle of a scene far from the origin, scene units; zero for others. It was subtracted."""
 
     here: BundleProblem
-    """The same problem near the origin, `in_frames` if it has rigs."""
+    """The same problem near the origin, `in_frames` if it has rigs, `laid_out` if it has residuals of one's own."""
 
     def after(
         self, layout: Layout, order: Int[AnyArray, " points"], state: LMState, options: StepOptions
@@ -55,7 +56,10 @@ class Placed(NamedTuple):
         seen = np.flatnonzero(layout.camera_seen)  # padding cameras are not seen
         cameras = np.array(self.here.cameras, np.float64)
         cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
-        lenses, rigs = problem.lenses, problem.rigs
+        lenses, rigs, residuals = problem.lenses, problem.rigs, self.counted.residuals
+        if residuals is not None:
+            cameras, own = np.split(cameras, [cameras.shape[1] - sum(residuals.sizes)], axis=1)
+            residuals = with_block_values(problem, residuals, own)
         if lenses is not None:  # unobserved cameras follow the others with their lens
             lens = np.asarray(lenses.index)
             used, first = np.unique(lens[seen], return_index=True)
@@ -74,9 +78,9 @@ class Placed(NamedTuple):
         points[order[real]] = np.asarray(state.points, np.float64).T[real]
         found, constants = problem.replace(cameras=cameras, points=points, rigs=rigs), problem.constants
         if constants is None:
-            return shift(found, self.offset) if far else found
+            return (shift(found, self.offset) if far else found).replace(residuals=residuals)
         poses = np.asarray(constants.poses)
-        found = shift(_with_constants(found, problem, constants, poses), self.offset)
+        found = shift(_with_constants(found, problem, constants, poses), self.offset).replace(residuals=residuals)
         # bit for bit: parts of a translation are constant only where the rotation is, else those of the shifted scene
         return _with_constants(found, self.counted, constants, poses & poses[:, :1])
 
@@ -90,7 +94,7 @@ def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NO_CAMERAS) 
     """
     counted = without_views_of(problem, away)
     offset = far_middle(counted)
-    return Placed(counted, offset, in_frames(shift(counted, -offset)))
+    return Placed(counted, offset, laid_out(in_frames(shift(counted, -offset))))
 
 
 def check_problem(problem: BundleProblem) -> None:

@@ -97,7 +97,8 @@ class Setup(ArrayRecord):
         found = self.placed.after(self.layout, order, state._replace(points=points), self.options)
         if not len(self.away):
             return found
-        return self.problem.replace(cameras=found.cameras, points=found.points, rigs=found.rigs)
+        parts = {name: getattr(found, name) for name in ("cameras", "points", "rigs", "residuals")}
+        return self.problem.replace(**parts)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

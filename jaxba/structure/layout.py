@@ -41,6 +41,7 @@ from jaxba.structure.density import is_dense
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.random_partitions import Partition, partition_layout
+from jaxba.structure.residual_slots import ResidualSlots, residual_slots
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
@@ -62,7 +63,7 @@ class Layout(ArrayRecord):
     """Point of each slot, in layout order."""
 
     slot_mask: Bool[AnyArray, " slots"]
-    """Whether the slot holds an observation."""
+    """Whether the slot holds an observation with pixels."""
 
     observation: Int[AnyArray, " slots"]
     """Index in the problem of the observation of each slot; out of range in empty slots."""
@@ -102,6 +103,9 @@ class Layout(ArrayRecord):
 
     unknowns: Unknowns
     """Camera models, and what is shared or constant."""
+
+    residuals: tuple[ResidualSlots, ...]
+    """Residuals of one's own, and the slots that their rows have."""
 
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
     """Shape of each bucket; empty for a layout with fixed capacity."""
@@ -147,7 +151,7 @@ def build_layout(
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
     Args:
-        problem: a checked problem, `in_frames` if it has rigs; host arrays.
+        problem: a checked problem, `in_frames` if it has rigs, `laid_out` if it has residuals of one's own; host arrays.
         options: of the step: the layout has exactly the parts that it needs. If it forms the reduced camera system, it
             lists pairs of observations: `t (t + 1) / 2` of each point with t observations.
         capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
@@ -208,7 +212,7 @@ def build_layout(
             cameras,
             int(sorted_index[empty]),
             factor=factor,
-            banded=not unknowns.poses.several,
+            banded=not unknowns.merged,
             capacity=capacity,
             agreement=agreement.within("pairs"),
         )
@@ -219,7 +223,7 @@ def build_layout(
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slots.point,
-        slot_mask=in_slots(np.ones(len(camera), bool)),
+        slot_mask=in_slots(~_stands_for_rows(problem)[order]),
         observation=in_slots(order.astype(np.int32), len(order)),
         pixels=in_order(problem.observations),
         whitening=None if problem.whitening is None else in_order(problem.whitening),
@@ -232,8 +236,25 @@ def build_layout(
         clusters=camera_clusters,
         partitions=drawn_partitions,
         unknowns=unknowns,
+        residuals=residual_slots(problem, _inverse(slot, order), slots.points, agreement.within("residuals")),
         buckets=slots.buckets,
     )
+
+
+def _stands_for_rows(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
+    """Which observations have no pixels, but stand for rows of residuals (structure/residual_slots.py)."""
+    found = np.zeros(problem.num_observations, bool)
+    for rows in () if problem.residuals is None else problem.residuals.rows:
+        if rows.observation is not None:
+            found[rows.observation[rows.observation >= 0]] = True
+    return found
+
+
+def _inverse(slot: Int[np.ndarray, " sorted"], order: Int[np.ndarray, " sorted"]) -> Int[np.ndarray, " observations"]:
+    """The slot of each observation of the problem."""
+    found = np.zeros(len(order), np.int32)
+    found[order] = slot
+    return found
 
 
 def num_partitions(layout: Layout) -> int:

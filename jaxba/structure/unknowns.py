@@ -33,6 +33,7 @@ from jaxba.problem.options import Intrinsics
 from jaxba.problem.priors import Priors
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.agreement import Agreement
+from jaxba.structure.residual_slots import block_groups
 from jaxba.structure.sharing import Mask, Sharing
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
@@ -47,6 +48,9 @@ class Unknowns(ArrayRecord):
 
     lenses: Sharing
     """Observed cameras that have a lens in common of which something is optimised."""
+
+    own: tuple[Sharing, ...]
+    """Of each block of residuals of one's own, which cameras have a row of it in common."""
 
     free: Mask
     """Which unknowns of each camera's block are optimised, [width, cameras]."""
@@ -68,10 +72,13 @@ class Unknowns(ArrayRecord):
     """Whether every observed camera has a lens in common with others."""
 
     columns: tuple[int, ...] = field(metadata={"static": True})
-    """Numbers of a lens, and then of extrinsics, that are part of a camera's block, ascending."""
+    """Numbers of a lens, then of extrinsics and of blocks of residuals, that are part of a camera's block, ascending."""
 
     lens_size: int = field(metadata={"static": True})
     """Number of all intrinsics of a camera."""
+
+    own_sizes: tuple[int, ...] = field(metadata={"static": True})
+    """Numbers of these blocks, the last ones of a camera."""
 
     in_rigs: bool = field(metadata={"static": True})
     """Whether poses are those of frames, and the last numbers of a camera its extrinsics (problem/rigs.py)."""
@@ -83,13 +90,24 @@ class Unknowns(ArrayRecord):
 
     @property
     def size(self) -> int:
-        """Number of all intrinsics of a camera, and of its extrinsics if it is in a rig."""
-        return self.lens_size + EXTRINSICS_SIZE * self.in_rigs
+        """Number of all intrinsics of a camera, of its extrinsics if it is in a rig, and of blocks of residuals."""
+        return self.lens_size + EXTRINSICS_SIZE * self.in_rigs + sum(self.own_sizes)
 
     @property
     def shared(self) -> bool:
         """Whether several cameras have a number in common: of a lens, or the pose of a frame."""
-        return self.poses.several or self.lenses.several
+        return any(sharing.several for sharing, _ in self._parts)
+
+    @property
+    def merged(self) -> bool:
+        """Whether a factorisation merges rows and columns of what is shared, and has no lenses as a border."""
+        return self.poses.several or (self.shared and bool(self.own))
+
+    @property
+    def _parts(self) -> tuple[tuple[Sharing, int], ...]:
+        """What shares the columns of a camera's block, in order, and how many these are."""
+        lens = (self.lenses, len(self.columns) - sum(self.own_sizes))
+        return (self.poses, POSE_SIZE), lens, *zip(self.own, self.own_sizes, strict=True)
 
     @property
     def width(self) -> int:
@@ -99,13 +117,16 @@ class Unknowns(ArrayRecord):
     @property
     def numbers(self) -> Sharing:
         """Which unknowns of all blocks, flattened, are the same."""
-        return Sharing.joined((self.poses, POSE_SIZE), (self.lenses, len(self.columns)))
+        return Sharing.joined(*self._parts)
 
     def _each(self, name: str, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         if not self.shared:
             return x
-        parts = (self.poses, x[:, :POSE_SIZE]), (self.lenses, x[:, POSE_SIZE:])
-        return jnp.concatenate([getattr(sharing, name)(part) for sharing, part in parts], axis=1)
+        found, start = [], 0
+        for sharing, size in self._parts:
+            found.append(getattr(sharing, name)(x[:, start : start + size]))
+            start += size
+        return jnp.concatenate(found, axis=1)
 
     def sums(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         """For each number the sum over the cameras that have it in common."""
@@ -126,9 +147,9 @@ class Unknowns(ArrayRecord):
             intrinsics: `fixed`: all intrinsics are.
             alone: whether cameras are optimised one by one, so that what some of them share is.
         """
-        shared = alone and self.lenses.several
-        lens = (shared or (intrinsics == "fixed" and column < self.lens_size) for column in self.columns)
-        return (*(alone and self.poses.several,) * POSE_SIZE, *lens)
+        together = [alone and sharing.several for sharing, size in self._parts for _ in range(size)]
+        fixed = [*[False] * POSE_SIZE, *(intrinsics == "fixed" and column < self.lens_size for column in self.columns)]
+        return tuple(one or other for one, other in zip(together, fixed, strict=True))
 
     def restricted(
         self, changes: Float[AnyArray, "*steps parameters cameras"]
@@ -169,7 +190,9 @@ def unknowns_of(
     lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
     padding, index = len(seen) - cameras, np.asarray(lenses.index)
     poses_free = free_poses(problem)
-    lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:]])
+    own_sizes = () if problem.residuals is None else problem.residuals.sizes
+    own_free = np.ones((cameras, sum(own_sizes)), bool)
+    lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:], own_free])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
     free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
     free = np.pad(free, ((0, padding), (0, 0)), constant_values=True)
@@ -181,7 +204,8 @@ def unknowns_of(
     model = np.zeros(cameras, np.int32) if lenses.model is None else np.asarray(lenses.model)[index]
     return Unknowns(
         poses=Sharing.of(apart if problem.rigs is None else padded(_frames(problem))),
-        lenses=shares if columns else Sharing.of(apart),
+        lenses=shares if len(columns) > sum(own_sizes) else Sharing.of(apart),
+        own=tuple(Sharing.of(padded(group)) for group in block_groups(problem)),
         free=Mask.of(free.T),
         free_points=Mask(np.append(~held, True)[np.minimum(order, points)], not any_held),
         model=np.pad(model, (0, padding)),
@@ -190,6 +214,7 @@ def unknowns_of(
         all_shared=bool(np.isin(shares.index, shares.owners)[seen].all()),
         columns=columns,
         lens_size=lens_size(lenses),
+        own_sizes=own_sizes,
         in_rigs=problem.rigs is not None,
     )
 
@@ -229,6 +254,18 @@ NONE_SHARED = Sharing.of(np.zeros(0, np.int32))
 ALL_FREE = Mask(np.zeros(0, bool), True)
 
 BAL_UNKNOWNS = Unknowns(
-    NONE_SHARED, NONE_SHARED, ALL_FREE, ALL_FREE, np.zeros(0, np.int32), (), (BAL,), False, (0, 1, 2), LENS_SIZE, False
+    poses=NONE_SHARED,
+    lenses=NONE_SHARED,
+    own=(),
+    free=ALL_FREE,
+    free_points=ALL_FREE,
+    model=np.zeros(0, np.int32),
+    priors=(),
+    models=(BAL,),
+    all_shared=False,
+    columns=(0, 1, 2),
+    lens_size=LENS_SIZE,
+    own_sizes=(),
+    in_rigs=False,
 )
 """Those of BAL cameras, all of whose numbers are optimised, however many there are."""

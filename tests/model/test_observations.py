@@ -129,7 +129,9 @@ def test_point_iterations_are_the_same_in_fast_compilation(loss):
     def found(fast: bool):
         with fast_compilation(fast):
             frames = slot_frames(layout, state.cameras)
-            return jax.jit(lambda layout, points: refine_points(layout, frames, points, loss, 3))(layout, state.points)
+            return jax.jit(lambda layout, points: refine_points(layout, state.cameras, frames, points, loss, 3))(
+                layout, state.points
+            )
 
     (points, costs), (stored_points, stored_costs) = found(False), found(True)
     np.testing.assert_allclose(points, stored_points, rtol=1e-7, atol=1e-7)

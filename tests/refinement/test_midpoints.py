@@ -25,7 +25,7 @@ LOSS = Loss()
 @functools.partial(jax.jit, static_argnames=("loss",))
 def _starts(layout, cameras, before, points, loss):
     previous = PreviousPoints.of(layout, before, linearize(layout, cameras, before, loss).reference)
-    return choose_starts(layout, slot_frames(layout, cameras), points, loss, previous)
+    return choose_starts(layout, cameras, slot_frames(layout, cameras), points, loss, previous)
 
 
 def _there(layout, cameras, before):
@@ -37,13 +37,15 @@ def _there(layout, cameras, before):
 def _refined(layout, cameras, before, start):
     """Points and costs, stacked."""
     frames, previous = _there(layout, cameras, before)
-    return jnp.concatenate([(found := refine_points(layout, frames, start, LOSS, 3, previous))[0], found[1][None]])
+    return jnp.concatenate(
+        [(found := refine_points(layout, cameras, frames, start, LOSS, 3, previous))[0], found[1][None]]
+    )
 
 
 @jax.jit
 def _from_starts(layout, cameras, before, points, starts):
     frames, previous = _there(layout, cameras, before)
-    found = refine_from_starts(layout, frames, points, LOSS, 3, previous, starts)
+    found = refine_from_starts(layout, cameras, frames, points, LOSS, 3, previous, starts)
     return jnp.concatenate([found[0], found[1][None]])
 
 

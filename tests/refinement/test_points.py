@@ -76,7 +76,9 @@ def test_points_take_no_further_step_after_one_that_brought_no_more_than_enough(
     layout, state = start(support.tiny())
     frames, loss = slot_frames(layout, state.cameras), Loss()
     refine = jax.jit(
-        lambda points, iterations, enough: refine_points(layout, frames, points, loss, iterations, None, enough)
+        lambda points, iterations, enough: refine_points(
+            layout, state.cameras, frames, points, loss, iterations, None, enough
+        )
     )
     total = lambda iterations, enough=-np.inf: float(np.sum(refine(state.points, iterations, enough)[1]))
     totals = [total(k) for k in range(5)]
@@ -183,7 +185,8 @@ def mirrored(problem: BundleProblem, which: np.ndarray) -> BundleProblem:
 def _refined_after(layout, state, points, loss, iterations):
     """Points that a step took from those of the state to `points`, after point iterations."""
     previous = PreviousPoints.of(layout, state.points, linearize(layout, state.cameras, state.points, loss).reference)
-    return refine_points(layout, slot_frames(layout, state.cameras), points, loss, iterations, previous)
+    frames = slot_frames(layout, state.cameras)
+    return refine_points(layout, state.cameras, frames, points, loss, iterations, previous)
 
 
 def test_points_that_a_step_sent_behind_a_camera_start_again_from_previous():

@@ -1,0 +1,207 @@
+"""Residuals of one's own: functions of unknowns and data, in JAX, whose rows are registered with a problem.
+
+    f = 1/2 sum_i rho(|r_i|^2) + 1/2 sum_k sum_rows rho_k(|r_k(unknowns, data)|^2)
+
+A function's positional parameters are unknowns, by name: `pose`, `lens` and `point`, and any other name for a block of
+numbers of its own, one for each camera or a few for all. With `_2` after it a name means those of a second camera.
+Keyword-only parameters are data, a row each. The function whitens its residual itself.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxba.problem.checks import indices, plain_array, real_numbers, shown
+from jaxba.problem.losses import Loss
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
+
+POSE, LENS, POINT = "pose", "lens", "point"
+"""Names of unknowns that every problem has."""
+
+SECOND = "_2"
+"""Ending of the names of a second camera's unknowns."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """A function that `jaxba.residual` has read. Called with an index array for each unknown and a row of data for each
+    keyword, it makes the rows that `jaxba.with_residual` registers."""
+
+    function: Callable[..., Any]
+    """From `Pose`, `Lens`, arrays of points and blocks, and data to a vector or a number, of JAX."""
+
+    unknowns: tuple[str, ...]
+    """Names of its positional parameters."""
+
+    data: tuple[str, ...]
+    """Names of its keyword-only parameters."""
+
+    @property
+    def name(self) -> str:
+        """Name of the function: the kind of its costs."""
+        return self.function.__name__
+
+    def __call__(self, **columns: Any) -> Rows:
+        """Rows of the residual.
+
+        Args:
+            columns: for each unknown an index or a vector of them: a camera for `pose`, a point for `point`, a lens (a
+                camera in a problem without shared lenses) for `lens`, a row for a block. For each keyword of data an
+                array with a row for each residual, or one value for all.
+
+        Raises:
+            ValueError: a name is missing or unknown, lengths differ, or something is no index or no number; one line.
+        """
+        names = (*self.unknowns, *self.data)
+        for what, found in (("has no", columns.keys() - set(names)), ("needs", set(names) - columns.keys())):
+            if found:
+                raise ValueError(f"residual {self.name} {what} {min(found)}; its parameters: {', '.join(names)}")
+        given = [np.atleast_1d(plain_array(f"{x} of {self.name}", columns[x])) for x in self.unknowns]
+        count = max(map(len, given))
+        index = tuple(
+            indices(f"{x} of {self.name}", np.broadcast_to(one, count) if one.shape == (1,) else one, 2**31 - 1, count)
+            for x, one in zip(self.unknowns, given, strict=True)
+        )
+        data = []
+        for x in self.data:
+            value = real_numbers(f"{x} of {self.name}", columns[x])
+            if not np.isfinite(value).all():
+                raise ValueError(f"{x} of {self.name} must be finite")
+            data.append(value if value.shape[:1] == (count,) else np.broadcast_to(value, (count, *value.shape)))
+        return Rows(index, tuple(data), residual=self)
+
+
+def residual(function: Callable[..., Any]) -> Residual:
+    """A decorator: a function as a residual.
+
+    Args:
+        function: positional parameters are unknowns, keyword-only ones data (`jaxba.with_residual`). It is
+            differentiated by JAX, for one row at a time, and returns a number or a vector, whitened.
+
+    Raises:
+        ValueError: it has no unknown, or parameters of another kind; one line.
+    """
+    kinds = inspect.Parameter
+    found = inspect.signature(function).parameters.values()
+    wrong = [p.name for p in found if p.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD) or p.default is not p.empty]
+    if wrong:
+        raise ValueError(f"parameter {wrong[0]} of residual {function.__name__}: no *, ** and defaults")
+    data = tuple(p.name for p in found if p.kind == kinds.KEYWORD_ONLY)
+    unknowns = tuple(p.name for p in found if p.name not in data)
+    if not unknowns:
+        raise ValueError(f"residual {function.__name__} has no unknown: its positional parameters are unknowns")
+    return Residual(function, unknowns, data)
+
+
+@register_pytree
+@dataclass(frozen=True, eq=False, repr=False)
+class Rows(ArrayRecord):
+    """Rows of one residual."""
+
+    index: tuple[Int[AnyArray, " rows"], ...]
+    """For each unknown of the function the camera, lens, point or row of its block."""
+
+    data: tuple[Float[AnyArray, "rows ..."], ...]
+    """For each keyword of the function its values."""
+
+    observation: Int[AnyArray, "rows pairs cameras"] | None = None
+    """Observations that stand for the rows in a problem that is laid out (structure/residual_slots.py)."""
+
+    residual: Residual = field(metadata={"static": True}, kw_only=True)
+    """The function."""
+
+    loss: Loss = field(default=Loss(), metadata={"static": True}, kw_only=True)
+    """Robust loss of the squared norm of a row."""
+
+    size: int = field(default=0, metadata={"static": True}, kw_only=True)
+    """Numbers that the function returns; 0 before it is registered."""
+
+    def __len__(self) -> int:
+        return len(self.index[0])
+
+    def of(self, kept: Int[np.ndarray, " kept"] | Bool[np.ndarray, " rows"]) -> Rows:
+        """Some of the rows."""
+        observation = None if self.observation is None else np.asarray(self.observation)[kept]
+        index, data = (tuple(np.asarray(x)[kept] for x in part) for part in (self.index, self.data))
+        return replace(self, index=index, data=data, observation=observation)
+
+    def of_point(self) -> int | None:
+        """Position of the point among the unknowns."""
+        return self.residual.unknowns.index(POINT) if POINT in self.residual.unknowns else None
+
+
+@register_pytree
+@dataclass(frozen=True, eq=False, repr=False)
+class Residuals(ArrayRecord):
+    """All residuals of a problem besides those of its pixels, and the unknowns that only they have."""
+
+    rows: tuple[Rows, ...] = ()
+    """Rows of each residual."""
+
+    blocks: tuple[Float[AnyArray, "n numbers"], ...] = ()
+    """Values of the unknowns that only residuals have, a row for each camera, or fewer."""
+
+    scale: Float[AnyArray, ""] = field(default_factory=lambda: np.ones(()))
+    """With rotation and translation: functions see `scale rotation x + translation` for a position x of the problem,
+    which may have been moved since they were registered."""
+
+    rotation: Float[AnyArray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    translation: Float[AnyArray, "3"] = field(default_factory=lambda: np.zeros(3))
+
+    names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    """Names of the blocks."""
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Numbers in a row of each block."""
+        return tuple(block.shape[1] for block in self.blocks)
+
+    def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Residuals:
+        """Those of a problem whose positions x have become `scale rotation x + translation`."""
+        own, turn = np.asarray(self.scale) / scale, np.asarray(self.rotation) @ rotation.T
+        return replace(self, scale=own, rotation=turn, translation=self.translation - own * turn @ translation)
+
+    def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals:
+        """Those of some of the observations and points of a problem that is laid out."""
+        place = np.where(observations, np.cumsum(observations) - 1, -1)
+        found = []
+        for rows in self.rows:
+            own = place[np.asarray(rows.observation)]
+            rows = replace(rows, observation=own).of((own >= 0).any(axis=(1, 2)))
+            at = rows.of_point()
+            if at is not None:
+                index = [*rows.index]
+                index[at] = np.searchsorted(points, index[at]).astype(np.int32)
+                rows = replace(rows, index=tuple(index))
+            found.append(rows)
+        return replace(self, rows=tuple(found))
+
+
+def with_rows(
+    residuals: Residuals | None, rows: Rows, unknowns: dict[str, Any], counts: dict[str, int], where: str = ""
+) -> Residuals:
+    """Residuals with other rows and new blocks, of a problem with so many cameras, lenses and points (by their names).
+
+    Raises ValueError: a block is missing, there already, or no matrix of finite numbers; or an index is out of range.
+    """
+    residuals = residuals or Residuals()
+    blocks = dict(zip(residuals.names, residuals.blocks, strict=True))
+    for name, value in unknowns.items():
+        if name in counts or name in blocks or name.endswith(SECOND):
+            raise ValueError(f"unknown {name} is there already" if name in blocks else f"no block may be named {name}")
+        blocks[name] = real_numbers(f"unknown {name}", value)
+        if blocks[name].ndim != 2 or not blocks[name].size or not np.isfinite(blocks[name]).all():
+            raise ValueError(f"unknown {name} must have finite numbers of shape (n, numbers), not {shown(value)}")
+    counts = counts | {name: len(block) for name, block in blocks.items()}
+    for name, index in zip(rows.residual.unknowns, rows.index, strict=True):
+        base = name.removesuffix(SECOND)
+        if base not in counts:
+            raise ValueError(f"{name} of residual {rows.residual.name} has no start: give unknowns={{'{base}': array}}")
+        indices(f"{name} of {rows.residual.name}", index, counts[base], len(rows))
+    return replace(residuals, rows=(*residuals.rows, rows), blocks=tuple(blocks.values()), names=tuple(blocks))

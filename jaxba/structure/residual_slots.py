@@ -1,0 +1,276 @@
+"""Rows of residuals as observations, so that everything that is summed over observations is summed over them, too.
+
+An observation has one camera and one point, and a slot for its two residuals (structure/layout.py). A row of n residuals
+is laid out as n / 2 observations of its camera and its point, without pixels. What a row lacks is made up for by zero
+columns: a row without a camera has some camera that sees its point, one without a point has a new point of its own.
+
+A row of two cameras is split by a variable v, for each pair of residuals a new point. With `r + a + b` for the residual
+and its first-order changes by the two cameras,
+
+    min_v  |sqrt(2) (r/2 + a + v)|^2 + |sqrt(2) (r/2 + b - v)|^2  =  |r + a + b|^2
+
+so that eliminating v like any point gives the block of the two cameras. Damping also holds v, by the share lambda.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.losses import Loss
+from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residual, Residuals, Rows
+from jaxba.structure.agreement import Agreement
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
+
+
+@register_pytree
+@dataclass(frozen=True, eq=False, repr=False)
+class ResidualSlots(ArrayRecord):
+    """Rows of one residual in a layout."""
+
+    cameras: tuple[Int[AnyArray, " rows"], ...]
+    """One or two cameras of each row."""
+
+    point: Int[AnyArray, " rows"]
+    """Point of each row, in layout order; any if the function takes none."""
+
+    slots: Int[AnyArray, "rows pairs cameras"]
+    """Slots of each row: of each pair of residuals, and each camera; out of range where there is none."""
+
+    data: tuple[Float[AnyArray, "rows ..."], ...]
+    """Data of the function."""
+
+    scale: Float[AnyArray, ""]
+    rotation: Float[AnyArray, "3 3"]
+    translation: Float[AnyArray, "3"]
+    """See `Residuals`."""
+
+    residual: Residual = field(metadata={"static": True})
+    loss: Loss = field(metadata={"static": True})
+    size: int = field(metadata={"static": True})
+    """See `Rows`."""
+
+    places: tuple[tuple[int, int], ...] = field(metadata={"static": True})
+    """For each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
+    is no block."""
+
+    @property
+    def has_point(self) -> bool:
+        """Whether the function takes a point."""
+        return POINT in self.residual.unknowns
+
+
+class Owners(NamedTuple):
+    """Which cameras and point stand for each row of a residual."""
+
+    cameras: list[Int[np.ndarray, " rows"]]  # -1 for some camera that sees the point
+    point: Int[np.ndarray, " rows"]  # -1 for none
+
+
+def block_groups(problem: BundleProblem) -> list[Int[np.ndarray, " cameras"]]:
+    """For each block of residuals the row that each camera has, negative and different where it has none.
+
+    Raises:
+        ProblemError: a camera would have two rows of one block.
+    """
+    if problem.residuals is None:
+        return []
+    return [_groups(problem, name) for name in problem.residuals.names]
+
+
+def _groups(problem: BundleProblem, name: str) -> Int[np.ndarray, " cameras"]:
+    assert problem.residuals is not None
+    count = problem.num_cameras
+    if len(problem.residuals.blocks[problem.residuals.names.index(name)]) == count:
+        return np.arange(count)
+    found = -1 - np.arange(count)
+    for rows in problem.residuals.rows:
+        for place, own in enumerate(rows.residual.unknowns):
+            if own.removesuffix(SECOND) != name:
+                continue
+            camera, index = _named_camera(problem, rows, own.removeprefix(name)), np.asarray(rows.index[place])
+            known = camera >= 0
+            found[camera[known]] = index[known]
+            other = np.flatnonzero(found[camera[known]] != index[known])
+            if other.size:
+                which = camera[known][other[0]]
+                raise ProblemError(f"camera {which} has two rows of the unknown {name}: it needs one for each camera")
+    return found
+
+
+def _named_camera(problem: BundleProblem, rows: Rows, ending: str) -> Int[np.ndarray, " rows"]:
+    """The camera of each row that a pose, a lens or a block with a row for each camera names; -1 for none."""
+    residuals = problem.residuals
+    assert residuals is not None
+    lengths = dict(zip(residuals.names, map(len, residuals.blocks), strict=True))
+    found = np.full(len(rows), -1)
+    for name, index in zip(rows.residual.unknowns, rows.index, strict=True):
+        base = name.removesuffix(SECOND)
+        if (SECOND if name.endswith(SECOND) else "") != ending or base == POINT:
+            continue
+        if base == LENS and problem.lenses is not None:
+            lens = np.asarray(problem.lenses.index)
+            first = np.full(len(problem.lenses.free), -1)
+            first[lens[::-1]] = np.arange(len(lens))[::-1]
+            camera = np.where(found >= 0, found, first[index])
+            agrees = lens[camera] == index
+        elif base in (POSE, LENS) or lengths[base] == problem.num_cameras:
+            camera = np.asarray(index)
+            agrees = (found < 0) | (found == camera)
+        else:
+            continue
+        bad = np.flatnonzero(~agrees)
+        if bad.size:
+            at = f"row {bad[0]} of residual {rows.residual.name}"
+            raise ProblemError(f"{at}: {name} {index[bad[0]]} is not of camera {found[bad[0]]}, whose pose it has")
+        found = camera
+    return found
+
+
+def owners_of(problem: BundleProblem, rows: Rows, groups: list[Int[np.ndarray, " cameras"]]) -> Owners:
+    """Cameras and points that stand for rows.
+
+    Raises:
+        ProblemError: unknowns of a row are not of one camera, or a row has more than this can lay out.
+    """
+    names, residuals = rows.residual.unknowns, problem.residuals
+    assert residuals is not None
+    at = rows.of_point()
+    point = np.full(len(rows), -1) if at is None else np.asarray(rows.index[at])
+    cameras = []
+    for ending in dict.fromkeys(SECOND if name.endswith(SECOND) else "" for name in names if name != POINT):
+        camera = _named_camera(problem, rows, ending)
+        for name, index in zip(names, rows.index, strict=True):
+            base = name.removesuffix(SECOND)
+            if base in residuals.names and name == base + ending:
+                group = groups[residuals.names.index(base)]
+                first = np.full(group.max(initial=-1) + 2, -1)
+                named = np.flatnonzero(group >= 0)[::-1]
+                first[group[named]] = named
+                camera = np.where(camera >= 0, camera, first[np.minimum(index, len(first) - 1)])
+                if (camera < 0).any():
+                    raise ProblemError(f"no residual says which cameras have row {index.min()} of the unknown {base}")
+        cameras.append(camera)
+    if len(cameras) == 2 and at is not None:
+        raise ProblemError(f"residual {rows.residual.name}: two cameras and a point in one row are not supported")
+    return Owners(cameras or [np.full(len(rows), -1)], point)
+
+
+def laid_out(problem: BundleProblem) -> BundleProblem:
+    """A problem `in_frames` with its blocks after the numbers of cameras, and observations that stand for its residuals
+    after those of pixels, with new points where they need them. Without residuals it is the problem itself.
+
+    Raises:
+        ProblemError: see `owners_of`.
+    """
+    residuals = problem.residuals
+    if residuals is None:
+        return problem
+    camera, point = [np.asarray(problem.camera_index)], [np.asarray(problem.point_index)]
+    observations, points, found, groups = problem.num_observations, problem.num_points, [], block_groups(problem)
+    sees = np.zeros(problem.num_points, int)
+    sees[point[0]] = camera[0]
+    for rows in residuals.rows:
+        owners, pairs = owners_of(problem, rows, groups), -(-rows.size // 2)
+        shape = (len(rows), pairs, len(owners.cameras))
+        own = [np.where(c < 0, sees[np.maximum(owners.point, 0)], c) for c in owners.cameras]
+        if len(own) == 2:  # a point for each pair of residuals
+            at = points + np.arange(len(rows) * pairs).reshape(-1, pairs)
+        else:
+            at = np.where(owners.point < 0, points + np.arange(len(rows)), owners.point)[:, None]
+        points = max(points, int(at.max(initial=-1)) + 1)
+        camera.append(np.broadcast_to(np.stack(own, axis=1)[:, None], shape).ravel())
+        point.append(np.broadcast_to(at[:, :, None], shape).ravel())
+        size = len(camera[-1])
+        found.append(replace(rows, observation=observations + np.arange(size).reshape(shape)))
+        observations += size
+    more, extra = observations - problem.num_observations, points - problem.num_points
+    rest = lambda x, count: np.concatenate([np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)])
+    held = problem.constants
+    return problem.replace(
+        cameras=np.hstack([np.asarray(problem.cameras), *map(_of_cameras, residuals.blocks, groups)]),
+        points=rest(problem.points, extra),
+        observations=rest(problem.observations, more),
+        camera_index=np.concatenate(camera).astype(np.int32),
+        point_index=np.concatenate(point).astype(np.int32),
+        whitening=None if problem.whitening is None else rest(problem.whitening, more),
+        constants=None if held is None else replace(held, points=rest(held.points, extra)),
+        residuals=replace(residuals, rows=tuple(found)),
+    )
+
+
+def _of_cameras(
+    block: Float[AnyArray, "n numbers"], group: Int[np.ndarray, " cameras"]
+) -> Float[np.ndarray, "cameras numbers"]:
+    return np.where((group >= 0)[:, None], np.asarray(block)[np.maximum(group, 0)], 0.0)
+
+
+def with_block_values(
+    problem: BundleProblem, residuals: Residuals, values: Float[np.ndarray, "cameras numbers"]
+) -> Residuals:
+    """Residuals with the values of their blocks after a solve, from the numbers of cameras."""
+    blocks, start = [], 0
+    for block, group in zip(residuals.blocks, block_groups(problem), strict=True):
+        after, known = np.array(block), group >= 0
+        after[group[known]] = values[known, start : start + block.shape[1]]
+        blocks.append(after)
+        start += block.shape[1]
+    return replace(residuals, blocks=tuple(blocks))
+
+
+def residual_slots(
+    problem: BundleProblem,
+    slot: Int[np.ndarray, " observations"],
+    points: Int[np.ndarray, " points"],
+    agreement: Agreement,
+) -> tuple[ResidualSlots, ...]:
+    """Rows of a problem that is `laid_out`.
+
+    Args:
+        problem: the problem.
+        slot: of each observation.
+        points: the point at each position in layout order.
+        agreement: with the other shards of the problem.
+    """
+    residuals = problem.residuals
+    if residuals is None:
+        return ()
+    order = np.zeros(problem.num_points + 1, np.int32)
+    order[np.minimum(points, problem.num_points)] = np.arange(len(points))
+    ends = problem.cameras.shape[1] - sum(residuals.sizes) + np.cumsum([0, *residuals.sizes])
+    places = {name: (int(ends[k]), int(ends[k + 1])) for k, name in enumerate(residuals.names)}
+    found = []
+    for number, rows in enumerate(residuals.rows):
+        if rows.observation is None:
+            raise ValueError("a problem with residuals is laid out by jaxba.prepare")
+        observation = np.asarray(rows.observation)
+        own = np.where(observation < 0, len(slot) + len(points) + 2**30, slot[observation]).astype(np.int32)
+        camera = np.asarray(problem.camera_index)[observation.max(axis=1)]
+        at = rows.of_point()
+        point = np.zeros(len(rows), np.int32) if at is None else order[rows.index[at]]
+        count = agreement.size(f"rows {number}", len(rows))
+
+        def padded(x: Any, fill: Any = 0, count: int = count) -> np.ndarray:
+            return np.concatenate([x, np.full((count - len(x), *np.shape(x)[1:]), fill, np.asarray(x).dtype)])
+
+        data = tuple(np.concatenate([x, np.broadcast_to(x[:1], (count - len(x), *x.shape[1:]))]) for x in rows.data)
+        found.append(
+            ResidualSlots(
+                cameras=tuple(padded(c) for c in camera.T.astype(np.int32)),
+                point=padded(point),
+                slots=padded(own, 2**30),
+                data=data,
+                scale=residuals.scale,
+                rotation=residuals.rotation,
+                translation=residuals.translation,
+                residual=rows.residual,
+                loss=rows.loss,
+                size=rows.size,
+                places=tuple(places.get(name.removesuffix(SECOND), (0, 0)) for name in rows.residual.unknowns),
+            )
+        )
+    return tuple(found)

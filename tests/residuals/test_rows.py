@@ -1,0 +1,191 @@
+"""Every kind of row of a residual of one's own, against SciPy's least squares on the same cost written once more."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import jaxba
+from jaxba.problem import geometry
+from jaxba.scenes import SceneConfig, random_scene
+
+CAMERAS, POINTS = 5, 30
+AXES = np.diag([1.0, -1.0, -1.0])
+
+
+@jaxba.residual
+def position(pose, *, at, sigma):
+    return (pose.center - at) / sigma
+
+
+@jaxba.residual
+def control_point(point, *, at, sigma):
+    return (point - at) / sigma
+
+
+@jaxba.residual
+def focal_length(lens, *, mean, sigma):
+    return (lens.numbers[0] - mean) / sigma
+
+
+@jaxba.residual
+def depth(pose, point, image, *, measured, sigma):
+    return (image[0] * pose.to_camera(point)[2] + image[1] - measured) / sigma
+
+
+@jaxba.residual
+def relative_pose(pose, pose_2, *, turn, shift, sigma):
+    between = pose.between(pose_2)
+    off = between.rotation @ turn.T
+    axis = jnp.stack([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]) / 2
+    return jnp.concatenate([axis, between.translation - shift]) / sigma
+
+
+@jaxba.residual
+def drift(pose, pose_2, clock, clock_2, *, measured):
+    return 5.0 * (jnp.sum((pose.center - pose_2.center) ** 2) * (1 + clock[0]) - clock_2[0] - measured)
+
+
+@jaxba.residual
+def reprojection(pose, lens, point, *, pixel):
+    return lens.project(pose.to_camera(point)) - pixel
+
+
+def scene() -> jaxba.BundleProblem:
+    return random_scene(SceneConfig(CAMERAS, POINTS, CAMERAS * POINTS), 3)
+
+
+def depths(problem: jaxba.BundleProblem, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cameras, points and depths in one unit, of a third of the observations."""
+    chosen = rng.permutation(problem.num_observations)[: problem.num_observations // 3]
+    camera, point = problem.camera_index[chosen], problem.point_index[chosen]
+    rotation = geometry.rotation_matrices(problem.cameras[camera, :3])
+    local = np.einsum("nij,nj->ni", rotation, problem.points[point]) + problem.cameras[camera, 3:6]
+    return camera, point, -local[:, 2] * (1 + 0.05 * rng.standard_normal(len(chosen)))
+
+
+def pose(camera) -> tuple[jax.Array, jax.Array]:
+    """R and t of a BAL camera in the axes of COLMAP, by the exponential series."""
+    x, y, z = camera[:3]
+    skew = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return AXES @ jax.scipy.linalg.expm(skew), AXES @ camera[3:6]
+
+
+def pixels(camera, point) -> jax.Array:
+    rotation, translation = pose(camera)
+    local = rotation @ point + translation
+    plane = local[:2] / local[2] * np.array([1.0, -1.0])
+    square = plane @ plane
+    return camera[6] * (1 + camera[7] * square + camera[8] * square**2) * plane
+
+
+KINDS = {
+    "position": "pose alone",
+    "control": "point alone",
+    "focal": "lens alone",
+    "depth": "pose, point and a block for each camera",
+    "relative": "two poses",
+    "drift": "two poses and a block for all cameras",
+}
+
+
+def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
+    """A problem with rows of a kind, and these residuals as a function of cameras, points and blocks."""
+    problem, rng = scene(), np.random.default_rng(1)
+    centers = geometry.camera_centers(problem.cameras)
+    add, all_cameras = jaxba.with_residual, np.arange(CAMERAS)
+    center = lambda camera: -pose(camera)[0].T @ pose(camera)[1]
+    if kind == "position":
+        at = centers + 0.05 * rng.standard_normal(centers.shape)
+        found = add(problem, position(pose=all_cameras, at=at, sigma=0.02))
+        return found, lambda cameras, points, _: (jax.vmap(center)(cameras) - at) / 0.02
+    if kind == "control":
+        which, at = np.arange(0, POINTS, 3), problem.points[::3] + 0.03 * rng.standard_normal((POINTS // 3, 3))
+        sigma = np.linspace(0.01, 0.1, len(which))[:, None]
+        found = add(problem, control_point(point=which, at=at, sigma=sigma))
+        return found, lambda cameras, points, _: (points[which] - at) / sigma
+    if kind == "focal":
+        found = add(problem, focal_length(lens=all_cameras, mean=450.0, sigma=3.0))
+        return found, lambda cameras, points, _: (cameras[:, 6] - 450.0) / 3.0
+    if kind == "depth":
+        camera, point, measured = depths(problem, rng)
+        start = np.tile([1.0, 0.0], (CAMERAS, 1))
+        rows = depth(pose=camera, point=point, image=camera, measured=measured, sigma=0.1)
+        found = add(problem, rows, unknowns={"image": start})
+        of = lambda c, x, b: b[0] * (pose(c)[0] @ x + pose(c)[1])[2] + b[1]
+        return found, lambda cameras, points, blocks: (
+            (jax.vmap(of)(cameras[camera], points[point], blocks[0][camera]) - measured) / 0.1
+        )
+    if kind == "relative":
+        first, second = np.array([0, 1, 2, 4]), np.array([1, 2, 3, 0])
+        truth = [pose(jnp.asarray(c)) for c in problem.cameras]
+        turn = np.array([np.asarray(truth[j][0] @ truth[i][0].T) for i, j in zip(first, second, strict=True)])
+        turn = Rotation.from_rotvec(0.02 * rng.standard_normal((4, 3))).as_matrix() @ turn
+        moved = [np.asarray(truth[j][1]) - t @ np.asarray(truth[i][1]) for i, j, t in zip(first, second, turn, strict=True)]
+        sigma = np.array([0.01] * 3 + [0.05] * 3)
+        found = add(problem, relative_pose(pose=first, pose_2=second, turn=turn, shift=moved, sigma=sigma))
+
+        def of(one, other, turn, shift):
+            (r1, t1), (r2, t2) = pose(one), pose(other)
+            off = r2 @ r1.T @ turn.T
+            axis = jnp.array([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]) / 2
+            return jnp.concatenate([axis, t2 - r2 @ r1.T @ t1 - shift]) / sigma
+
+        given = turn, np.array(moved)
+        return found, lambda cameras, points, _: jax.vmap(of)(cameras[first], cameras[second], *given)
+    first, second = np.arange(CAMERAS - 1), np.arange(1, CAMERAS)
+    measured = np.sum((centers[first] - centers[second]) ** 2, axis=1) * 1.1
+    zero = np.zeros(CAMERAS - 1, int)
+    rows = drift(pose=first, pose_2=second, clock=zero, clock_2=zero, measured=measured)
+    found = add(problem, rows, unknowns={"clock": [[0.05]]})
+
+    def apart(one, other, clock, measured):
+        return 5.0 * (jnp.sum((center(one) - center(other)) ** 2) * (1 + clock[0]) - clock[0] - measured)
+
+    return found, lambda cameras, points, blocks: (
+        jax.vmap(apart, (0, 0, None, 0))(cameras[first], cameras[second], blocks[0][0], measured)
+    )
+
+
+def whole(problem: jaxba.BundleProblem, rows) -> tuple[np.ndarray, object]:
+    """All numbers of a problem as one vector, and its residuals as a function of them."""
+    parts = [problem.cameras, problem.points, *problem.residuals.blocks]
+    ends = np.cumsum([x.size for x in parts])
+
+    def split(x):
+        cameras, points, *blocks = [one.reshape(p.shape) for one, p in zip(jnp.split(x, ends[:-1]), parts, strict=True)]
+        return cameras, points, blocks
+
+    def residuals(x):
+        cameras, points, blocks = split(x)
+        own = jax.vmap(pixels)(cameras[problem.camera_index], points[problem.point_index]) - problem.observations
+        return jnp.concatenate([own.ravel(), rows(cameras, points, blocks).ravel()])
+
+    return np.concatenate([np.ravel(x) for x in parts]), residuals
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KINDS.values())
+def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
+    problem, rows = example(kind)
+    start, residuals = whole(problem, rows)
+    residuals = jax.jit(residuals)
+    solution = jaxba.solve(problem, "ceres", jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15)))
+    assert solution.initial_cost == pytest.approx(0.5 * np.sum(np.square(residuals(start))), rel=1e-11)
+    found = least_squares(residuals, start, jax.jit(jax.jacfwd(residuals)), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert solution.final_cost == pytest.approx(found.cost, rel=1e-9)
+    after, _ = whole(solution.problem, rows)
+    assert 0.5 * np.sum(np.square(residuals(after))) == pytest.approx(solution.final_cost, rel=1e-11)
+
+
+@pytest.mark.parametrize("linear_solver", ["explicit", "sparse", "implicit"])
+@pytest.mark.parametrize("policy", ["ceres", "bold"])
+def test_all_solvers_and_refinements_find_the_same_minimum(policy, linear_solver):
+    for kind in ("depth", "relative"):
+        problem, _ = example(kind)
+        truth = jaxba.solve(problem, "ceres").final_cost
+        options = jaxba.SolveOptions(linear_solver=linear_solver)
+        assert jaxba.solve(problem, policy, options).final_cost == pytest.approx(truth, rel=1e-4)
