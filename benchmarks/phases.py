@@ -138,7 +138,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
     count = options.refinement.points
     if count:
-        refine = lambda la, s: refine_points(la, slot_frames(la, s.cameras), s.points, plain.loss, count)
+        refine = lambda la, s: refine_points(la, s.cameras, slot_frames(la, s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
         yield phase("refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), state)
     yield phase("whole step", lambda la, s: step.lm_step(la, s, damping, plain), state)

@@ -390,7 +390,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
-    if args.covariance and problem.constants is None and problem.priors is None:
+    if args.covariance and problem.constants is None and problem.residuals is None:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
     return path, problem
 

@@ -64,7 +64,7 @@ def _with_shared(
 
 
 def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]:
-    """The diagonal blocks of S, `D_c` (and priors) `+ sum J_c^T (I - Q Q^T) J_c`.
+    """The diagonal blocks of S, `D_c + sum J_c^T (I - Q Q^T) J_c`.
 
     With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
     observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the

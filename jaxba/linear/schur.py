@@ -76,7 +76,7 @@ class CameraSystem(NamedTuple):
     """The reduced camera system without the sum of `Y Y^T`, which each solver forms or applies in its own way."""
 
     blocks: Float[Array, "cameras width width"]  # B + D_c, manifold coordinates
-    own: Float[Array, "cameras width width"]  # the part of it that is no sum over observations: D_c, and priors
+    own: Float[Array, "cameras width width"]  # the part of it that is no sum over observations: D_c
     gradient: Float[Array, "cameras width"]  # g_c, manifold coordinates
     right: Float[Array, "cameras width"]  # b, right-hand side of the reduced system
     # D_c, diagonal in the options' coordinates; each camera has an equal part of what is shared
@@ -163,8 +163,6 @@ def camera_system(
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
-    for own, slope in linear.priors:
-        blocks, gradient, right = blocks + own, gradient + slope, right - slope
     rotation = jnp.einsum("cji,cjk,ckl->cil", forward, blocks[:, :3, :3], forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
@@ -175,8 +173,7 @@ def camera_system(
     on_manifold = jnp.einsum("cji,cj,cjk->cik", inverse, extra[:, :3], inverse)
     added = extra[:, :, None] * jnp.eye(width, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(on_manifold)
-    own = sum((block for block, _ in linear.priors), added)
-    return CameraSystem(blocks + added, own, gradient, right, extra, gathered)
+    return CameraSystem(blocks + added, added, gradient, right, extra, gathered)
 
 
 def back_substitute(system: DampedSystem, step: Float[Array, "cameras width"]) -> list[Array]:

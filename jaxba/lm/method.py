@@ -87,8 +87,7 @@ def check_plain(options: StepOptions, error: type[ValueError] = ValueError, **as
 PLAIN_ONLY = {
     "rigs": "rigs need plain LM, not {}",
     "shared_lenses": "shared lenses need plain LM, not {}",
-    "priors": "priors need plain LM, not {}",
-    "residuals": "residuals of your own need plain LM, not {}",
+    "residuals": "priors and residuals of your own need plain LM, not {}",
     "devices": "several devices are for plain LM, not for {}",
     "mixed": "mixed types are for plain LM; methods have float64 or float32",
     "linear_solver": "linear_solver is for method lm; {} has its own",

@@ -182,5 +182,4 @@ def _check_lenses(layout: Layout, options: StepOptions) -> None:
         apart = options.refinement.camera_rounds or options.refinement.pattern_moves
         if options.coordinates.rotation != "manifold" or apart:
             raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
-    has = {"priors": bool(unknowns.priors), "residuals": bool(layout.residuals)}
-    check_plain(options, shared_lenses=unknowns.shared, **has)
+    check_plain(options, shared_lenses=unknowns.shared, residuals=bool(layout.residuals))

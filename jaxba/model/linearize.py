@@ -16,14 +16,13 @@ from jaxtyping import Bool, Float
 
 from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
-from jaxba.model.priors import PriorTerms, costs_of, prior_terms
 from jaxba.model.residuals import add_costs, linearized
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.compilation import traced_once
 from jaxba.runtime.fusion import compute_unfused
-from jaxba.structure.devices import on_one_device, sum_over_devices
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
 
@@ -33,7 +32,6 @@ class Reference(NamedTuple):
 
     costs: Array  # (slots,), pixels^2
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
-    prior_costs: tuple[Array, ...] = ()  # (cameras,), of what is known besides the pixels, if anything is
 
 
 class Linearization(NamedTuple):
@@ -47,7 +45,6 @@ class Linearization(NamedTuple):
     camera_jacobian: list[list[Array]]  # [2][width] of (slots,)
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     reference: Reference  # the part of it that does not need derivatives
-    priors: tuple[PriorTerms, ...]  # of cameras alone, if there are priors
 
 
 @traced_once()
@@ -80,16 +77,10 @@ def observation_costs(
 def cost(
     layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
-    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of the priors."""
+    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of other residuals."""
     # not fused with the sum: XLA would compile both to a slow library call
-    of_pixels = compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
-    return sum_over_devices(layout, sum(map(jnp.sum, prior_costs(layout, cameras)), of_pixels))
-
-
-def prior_costs(layout: Layout, cameras: Float[Array, "parameters cameras"]) -> tuple[Float[Array, " cameras"], ...]:
-    """The cost of the priors of each camera if there are any, on the first device."""
-    unknowns = layout.unknowns
-    return tuple(on_one_device(layout, costs_of(priors, unknowns, cameras)) for priors in unknowns.priors)
+    costs = compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
+    return sum_over_devices(layout, costs)
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:
@@ -144,8 +135,7 @@ def linearize(
     residual, rows = rows[:2], rows[2:]
     width = (len(rows) - 6) // 2
     by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
-    reference = Reference(costs, inverse_depth, prior_costs(layout, cameras))
-    return Linearization(residual, by_camera, by_point, reference, prior_terms(unknowns, cameras))
+    return Linearization(residual, by_camera, by_point, Reference(costs, inverse_depth))
 
 
 def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:

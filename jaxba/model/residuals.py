@@ -12,72 +12,19 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Float
 
 from jaxba.model import camera
-from jaxba.model.lens_models import BAL_LENS, LensModel, ModelledLens
-from jaxba.problem.camera_models import BAL
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.residuals import LENS, POINT, POSE, SECOND
+from jaxba.problem.row_value import Cameras, value
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.rotations import rotation_matrix
 from jaxba.structure.layout import Layout
 from jaxba.structure.residual_slots import ResidualSlots
 from jaxba.structure.unknowns import Unknowns
 
-AXES = np.array([1.0, -1.0, -1.0])
-"""From BAL's camera, which looks down -z with y up, to the axes of `Pose`."""
-
 ROOT = math.sqrt(2.0)
-
-
-class Pose(NamedTuple):
-    """The pose of an image as functions of residuals see it: `P = R X + t` in the axes of COLMAP and OpenCV, x to the
-    right, y down, z forward."""
-
-    rotation: Float[Array, "3 3"]
-    """R, from the world to the camera."""
-
-    translation: Float[Array, "3"]
-    """t, scene units."""
-
-    @property
-    def center(self) -> Float[Array, "3"]:
-        """The position of the camera."""
-        return -self.rotation.T @ self.translation
-
-    def to_camera(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """A point of the world in the camera's frame; its last number is the depth."""
-        return self.rotation @ point + self.translation
-
-    def to_world(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """A point of the camera's frame in the world."""
-        return self.rotation.T @ (point - self.translation)
-
-    def between(self, other: Pose) -> Pose:
-        """From the frame of this camera to that of another: `P_2 = R P_1 + t`."""
-        rotation = other.rotation @ self.rotation.T
-        return Pose(rotation, other.translation - rotation @ self.translation)
-
-
-class Lens(NamedTuple):
-    """The lens of an image as functions of residuals see it."""
-
-    numbers: Float[Array, " numbers"]
-    """Its numbers in the order of its camera model: f, k1 and k2 of BAL."""
-
-    model: LensModel
-    which: tuple[Array, ...]
-
-    def project(self, ray: Float[Array, "3"]) -> Float[Array, "2"]:
-        """The pixel of a point in the frame of the camera (`Pose.to_camera`), as `BundleProblem.observations`."""
-        x, y, z = ray * jnp.asarray(AXES, ray.dtype)
-        direction = [-x / z, -y / z]
-        radius = direction[0] * direction[0] + direction[1] * direction[1]
-        local, mask = [x, y, z], jnp.ones((), bool)
-        return jnp.stack(self.model.pixels(list(self.numbers), self.which, local, direction, radius, mask)[0])
 
 
 class Linear(NamedTuple):
@@ -204,25 +151,8 @@ def _value(
     columns = cameras.T
     if steps is not None:
         columns = camera.moved(columns, unknowns.expanded(steps.T), unknowns)
-    point = point if move is None else point + move
-    scale, turn, shift = (jnp.asarray(x, cameras.dtype) for x in (rows.scale, rows.rotation, rows.translation))
     angle_axis, translation = camera.poses(columns, unknowns)
-    matrices = rotation_matrix(angle_axis)
-    of = ModelledLens(unknowns.models) if unknowns.models != (BAL,) else BAL_LENS
-    axes = jnp.asarray(AXES, cameras.dtype)
-    arguments: list[Any] = []
-    for name, (start, end) in zip(rows.residual.unknowns, rows.places, strict=True):
-        base, which = name.removesuffix(SECOND), int(name.endswith(SECOND) and len(rows.cameras) > 1)
-        if base == POINT:
-            arguments.append(scale * turn @ point + shift)
-        elif base == POSE:
-            rotation = matrices[:, :, which] @ turn.T
-            moved = scale * translation[:, which] - rotation @ shift
-            arguments.append(Pose(axes[:, None] * rotation, axes * moved))
-        elif base == LENS:
-            numbers = columns[POSE_SIZE : POSE_SIZE + unknowns.lens_size, which]
-            arguments.append(Lens(numbers, of, (model[which],) if len(unknowns.models) > 1 else ()))
-        else:
-            arguments.append(columns[start:end, which])
-    found = rows.residual.function(*arguments, **dict(zip(rows.residual.data, data, strict=True)))
-    return jnp.atleast_1d(jnp.asarray(found, cameras.dtype))
+    lenses = columns[POSE_SIZE : POSE_SIZE + unknowns.lens_size].T
+    given = Cameras(jnp.moveaxis(rotation_matrix(angle_axis), 2, 0), translation.T, lenses, model, unknowns.models)
+    blocks = [columns[start:end].T for start, end in rows.places]
+    return value(rows, given, point if move is None else point + move, blocks, data)

@@ -16,7 +16,6 @@ from jaxba.problem.checks import indices, inverse_roots, real_numbers
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
-from jaxba.problem.priors import Priors, checked_priors
 from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import Rigs, checked_rigs
 from jaxba.typing import AnyArray, ArrayRecord, InputError, register_pytree
@@ -81,11 +80,8 @@ class BundleProblem(ArrayRecord):
     rigs: Rigs | None = None
     """Cameras that move together; None: every camera has a pose of its own."""
 
-    priors: Priors | None = None
-    """What is known of cameras besides the pixels; None: nothing."""
-
     residuals: Residuals | None = None
-    """Residuals of one's own (`jaxba.with_residual`); None: there are those of pixels and priors alone."""
+    """Residuals besides those of pixels: one's own (`jaxba.with_residual`) and priors; None: there are none."""
 
     labels: Labels | None = field(default=None, metadata={"host": True})
     """What the file calls images, lenses and points; None if nothing does."""
@@ -104,7 +100,6 @@ class BundleProblem(ArrayRecord):
         lenses: Lenses | None = None,
         constants: Constants | None = None,
         rigs: Rigs | None = None,
-        priors: Priors | None = None,
     ) -> BundleProblem:
         """Checks the arrays and returns a problem of float64 and int32 NumPy arrays.
 
@@ -121,7 +116,6 @@ class BundleProblem(ArrayRecord):
             lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
             constants: optional; poses and points that are not optimised.
             rigs: optional; cameras that move together.
-            priors: optional; what is known of cameras besides the pixels.
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
@@ -131,7 +125,7 @@ class BundleProblem(ArrayRecord):
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
         parts = {"lenses": (lenses, Lenses), "constants": (constants, Constants), "rigs": (rigs, Rigs)}
-        for name, (part, kind) in {**parts, "priors": (priors, Priors)}.items():
+        for name, (part, kind) in parts.items():
             if part is not None and not isinstance(part, kind):
                 raise ProblemError(f"{name} must be a {kind.__name__}, not of type {type(part).__name__}")
         try:
@@ -149,18 +143,15 @@ class BundleProblem(ArrayRecord):
                 constants = checked_constants(constants, len(cameras), len(points))
             if rigs is not None:
                 rigs = checked_rigs(rigs, cameras, lenses)
-            if priors is not None:
-                of_lenses = len(cameras) if lenses is None else len(lenses.free)
-                priors = checked_priors(priors, len(cameras), of_lenses, lens_size(lenses))
         except ValueError as error:
             raise error if isinstance(error, ProblemError) else ProblemError(str(error)) from None
         arrays = (cameras, points, observations, camera_index, point_index, whitening)
-        return cls(*arrays, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
+        return cls(*arrays, lenses=lenses, constants=constants, rigs=rigs)
 
     def __repr__(self) -> str:
         arrays = ("cameras", "points", "observations")
         counts = [f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays]
-        parts = ("whitening", "lenses", "constants", "rigs", "priors", "residuals", "labels")
+        parts = ("whitening", "lenses", "constants", "rigs", "residuals", "labels")
         return f"BundleProblem({', '.join([*counts, *(name for name in parts if getattr(self, name) is not None)])})"
 
     @property
@@ -192,9 +183,9 @@ class BundleProblem(ArrayRecord):
 
         Args:
             observations: a mask or positions; they name no other cameras and points than those that stay.
-            cameras: positions, ascending; None: all. Lenses and frames keep their numbers, priors are left out.
-            points: positions, ascending; None: all. With these or cameras there are no labels, and no residuals of
-                one's own but in a problem that is laid out (structure/residual_slots.py).
+            cameras: positions, ascending; None: all. Lenses and frames keep their numbers.
+            points: positions, ascending; None: all. With these or cameras there are no labels, and no residuals but
+                those of pixels, unless the problem is laid out (structure/residual_slots.py).
         """
         names = ("observations", "camera_index", "point_index", "whitening")
         arrays = {name: getattr(self, name) for name in names}
@@ -205,8 +196,8 @@ class BundleProblem(ArrayRecord):
         if points is not None:
             index = np.searchsorted(points, found.point_index).astype(np.int32)
             found = replace(found, points=np.asarray(self.points)[points], point_index=index, labels=None)
-            if self.residuals is not None:
-                found = replace(found, residuals=self.residuals.of(np.asarray(observations), points))
+            own = None if self.residuals is None else self.residuals.of(np.asarray(observations), points)
+            found = replace(found, residuals=own)
         if cameras is None:
             return found
         return replace(
@@ -215,7 +206,6 @@ class BundleProblem(ArrayRecord):
             camera_index=np.searchsorted(cameras, found.camera_index).astype(np.int32),
             lenses=None if self.lenses is None else self.lenses.of(cameras),
             rigs=None if self.rigs is None else self.rigs.of(cameras),
-            priors=None,
             residuals=None,
             labels=None,
         )

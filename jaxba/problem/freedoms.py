@@ -4,7 +4,8 @@ The cost of pixels does not change when the whole scene is moved, turned and sca
 
     X' = X + l e + w x (X - m) + s (X - m),    R' = exp(-R w) R,    t' = t - l R e + R (w x m) + s (t + R m).
 
-Constants, rigs and priors leave those combinations of the seven that keep each constant number and each measured value.
+Constants, rigs, priors and other residuals leave those combinations of the seven that keep each constant number and
+each residual.
 A point whose rays are all parallel, as one that is seen once, can move along them.
 """
 
@@ -19,6 +20,7 @@ from jaxba.problem.frames import free_poses, in_frames
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.preprocess import far_middle, middle_and_extent, observed, shift
 from jaxba.problem.rigs import first_of_group
+from jaxba.problem.row_changes import changes_by_similarity
 
 SIMILARITY = 7
 """Degrees of freedom of a similarity."""
@@ -29,8 +31,8 @@ it is a square, and this squared is some rounding errors of float64."""
 
 
 def fixed_freedoms(problem: BundleProblem) -> int:
-    """How many of the seven freedoms of a similarity constants, rigs and priors fix, of a problem far from the origin
-    as a solve shifts it."""
+    """How many of the seven freedoms of a similarity constants, rigs and residuals fix, of a problem far from the
+    origin as a solve shifts it."""
     return SIMILARITY - _freedoms(shift(problem, -far_middle(problem)))[0].shape[1]
 
 
@@ -55,7 +57,7 @@ def _freedoms(
     """An orthonormal basis of the combinations of w, e and s (in this order) that are free; derivatives of poses by the
     seven, and of extrinsics in rigs, (cameras, numbers, 7), with lengths in extents and zero for what is constant;
     which points move; the middle and the extent."""
-    here, constants, priors = in_frames(problem), problem.constants, problem.priors
+    here, constants = in_frames(problem), problem.constants
     seen, points_move = observed(problem)
     middle, extent = middle_and_extent(problem)
     extent = extent if extent > 0 else 1.0
@@ -73,14 +75,7 @@ def _freedoms(
         held = np.asarray(constants.points) & points_move
         rows.append(_motions((np.asarray(problem.points)[held] - middle) / extent))
         points_move = points_move & ~held
-    if priors is not None:
-        whole = np.asarray(problem.cameras)[seen]  # of cameras, not of their frames
-        turns = geometry.rotation_matrices(whole[:, :3]) @ np.eye(3, SIMILARITY)
-        places = _motions((geometry.camera_centers(whole) - middle) / extent)
-        for whitening, change in ((priors.position_whitening, places), (priors.rotation_whitening, turns)):
-            matrices = np.asarray(whitening, np.float64)[seen]
-            size = np.abs(matrices).max(axis=(1, 2), initial=0.0, keepdims=True)
-            rows.append(matrices / np.where(size > 0, size, 1.0) @ change)
+    rows += changes_by_similarity(problem, middle, extent)
     staying = np.concatenate([part.reshape(-1, SIMILARITY) for part in rows])
     staying /= np.maximum(np.abs(staying).max(axis=1, keepdims=True), 1.0)  # far away small turns are large motions
     _, values, basis = np.linalg.svd(staying, full_matrices=False)

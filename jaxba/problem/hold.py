@@ -101,7 +101,7 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    scaled = fixed_freedoms(problem.replace(constants=None, priors=None)) > 0  # by rigs alone
+    scaled = fixed_freedoms(problem.replace(constants=None, residuals=None)) > 0  # by rigs alone
     if fixed_freedoms(problem) == SIMILARITY:
         note = f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already"
         warnings.warn(note, ProblemWarning, stacklevel=2)

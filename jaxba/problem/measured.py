@@ -10,14 +10,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.problem.alignment import aligned
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.checks import finite, inverse_roots, shown
+from jaxba.problem.geometry import rotation_matrices
 from jaxba.problem.hold import every_lens, number_columns, positions_of
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
-from jaxba.problem.priors import Priors
+from jaxba.problem.residuals import Residuals, Rows, residual
+from jaxba.problem.row_value import AXES
 
 LEAST_VARIANCE = 1e-200
 """Smallest eigenvalue of a covariance whose inverse can be computed with."""
@@ -62,15 +65,11 @@ def with_position_priors(
     if not isinstance(loss, Loss | None):
         raise ValueError(f"loss must be a jaxba.Loss, not {shown(loss)}")
     if align:
-        if problem.constants is not None or problem.priors is not None:
+        if problem.constants is not None or problem.residuals is not None:
             raise ProblemError("an alignment would move what is constant or measured: align first, or align=False")
         problem = aligned(problem, measured, covariances, at)
-    priors = priors_of(problem)
-    places, weights = np.array(priors.positions), np.array(priors.position_whitening)
-    places[at], weights[at] = measured, roots
-    return problem.replace(
-        priors=replace(priors, positions=places, position_whitening=weights, position_loss=loss or Loss())
-    )
+    rows = position_prior(pose=at, position=measured, whitening=roots)
+    return _with(problem, replace(rows, loss=loss or Loss(), size=3))
 
 
 def with_rotation_priors(
@@ -89,10 +88,9 @@ def with_rotation_priors(
     """
     at = _images_at(problem, images)
     measured = finite("rotations", rotations, (len(at), 3))
-    priors = priors_of(problem)
-    known, weights = np.array(priors.rotations), np.array(priors.rotation_whitening)
-    known[at], weights[at] = measured, _covariances(problem, "rotation", covariance, at)[1]
-    return problem.replace(priors=replace(priors, rotations=known, rotation_whitening=weights))
+    whitening = AXES * _covariances(problem, "rotation", covariance, at)[1] * AXES[:, None]
+    matrices = AXES[:, None] * rotation_matrices(measured)
+    return _with(problem, replace(rotation_prior(pose=at, rotation=matrices, whitening=whitening), size=3))
 
 
 def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> BundleProblem:
@@ -106,12 +104,9 @@ def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> Bundl
     Raises:
         ValueError: no such number, or a standard deviation that is not positive; one line.
     """
-    lenses, priors = every_lens(problem), priors_of(problem)
-    mean, weight = np.array(priors.lenses), np.array(priors.lens_weight)
-    cameras = np.asarray(problem.cameras)
-    _, first = np.unique(lenses.index, return_index=True)
-    used = np.asarray(lenses.index)[first]
-    mean[used] = cameras[first, 6:]
+    lenses = every_lens(problem)
+    used, first = np.unique(lenses.index, return_index=True)
+    mean, weight = np.asarray(problem.cameras)[first, POSE_SIZE:], np.zeros(np.asarray(lenses.free).shape)
     if not isinstance(numbers, dict):
         raise ValueError(f"standard deviations are a dict by the names of numbers, not {shown(numbers)}")
     for name, value in numbers.items():
@@ -119,17 +114,48 @@ def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> Bundl
         if deviation <= 0:
             raise ValueError(f"the standard deviation of {name} must be positive, is {deviation}")
         weight[number_columns(lenses, [name])] = 1 / deviation
-    return problem.replace(lenses=lenses, priors=replace(priors, lenses=mean, lens_weight=weight))
+    rows = lens_prior(lens=used, mean=mean, weight=weight[used])
+    return _with(problem.replace(lenses=lenses), replace(rows, size=mean.shape[1]))
 
 
-def priors_of(problem: BundleProblem) -> Priors:
-    """The priors of a problem, or ones without weight."""
-    if problem.priors is not None:
-        return problem.priors
-    count, lenses = problem.num_cameras, every_lens(problem)
-    none = np.zeros((count, 3, 3))
-    numbers = np.zeros(np.asarray(lenses.free).shape)
-    return Priors(np.zeros((count, 3)), none, np.array(problem.cameras)[:, :3], none, numbers, numbers)
+@residual
+def position_prior(pose, *, position, whitening):
+    """Whitened difference of a camera's centre from a measured position. Source: COLMAP,
+    `CovarianceWeightedCostFunctor<AbsolutePosePositionPriorCostFunctor>`."""
+    return whitening @ (pose.center - position)
+
+
+@residual
+def rotation_prior(pose, *, rotation, whitening):
+    """Whitened rotation from a measured one, in the camera's frame, both in the axes of `Pose`."""
+    return whitening @ pose.turn_from(rotation)
+
+
+@residual
+def lens_prior(lens, *, mean, weight):
+    """Differences of the numbers of a lens from expected ones, over standard deviations."""
+    return weight * (lens.numbers - mean)
+
+
+def _with(problem: BundleProblem, rows: Rows) -> BundleProblem:
+    """The problem with rows of a prior in place of earlier ones of the same cameras or lenses."""
+    known, kept = problem.residuals or Residuals(), []
+    for one in known.rows:
+        if one.residual == rows.residual:
+            one = one.of(~np.isin(one.index[0], rows.index[0]))
+        kept += [one] if len(one) else []
+    return problem.replace(residuals=replace(known, rows=(*kept, rows)))
+
+
+def positions_of_priors(
+    problem: BundleProblem,
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    """Images with measured positions, these positions, and their `Sigma^(-1/2)`."""
+    rows = [one for one in (problem.residuals or Residuals()).rows if one.residual == position_prior]
+    if not rows:
+        return np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3))
+    images, places, roots = zip(*((one.index[0], *one.data) for one in rows), strict=True)
+    return np.concatenate(images), np.concatenate(places), np.concatenate(roots)
 
 
 def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str] | None) -> np.ndarray:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, translations
+from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity, transformed
 
 POBA_SIZE, POBA_NOISE, POBA_MIN_DEPTH, POBA_SEED = 100.0, 0.01, 0.1, 38401
@@ -72,9 +73,16 @@ def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], f
 
 
 def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool[np.ndarray, " points"]]:
-    """Whether each camera, and each point, has an observation."""
-    cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras)
-    return cameras > 0, np.bincount(problem.point_index, minlength=problem.num_points) > 0
+    """Whether each camera, and each point, has an observation or a row of another residual."""
+    cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
+    points = np.bincount(problem.point_index, minlength=problem.num_points) > 0
+    groups = block_groups(problem)
+    for rows in () if problem.residuals is None else problem.residuals.rows:
+        owners = owners_of(problem, rows, groups)
+        for own in owners.cameras:
+            cameras[own[own >= 0]] = True
+        points[owners.point[owners.point >= 0]] = True
+    return cameras, points
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:

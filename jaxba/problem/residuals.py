@@ -47,6 +47,9 @@ class Residual:
         """Name of the function: the kind of its costs."""
         return self.function.__name__
 
+    def __repr__(self) -> str:
+        return f"Residual({self.name})"
+
     def __call__(self, **columns: Any) -> Rows:
         """Rows of the residual.
 
@@ -110,6 +113,13 @@ class Rows(ArrayRecord):
     data: tuple[Float[AnyArray, "rows ..."], ...]
     """For each keyword of the function its values."""
 
+    scale: Float[AnyArray, ""] = field(default_factory=lambda: np.ones(()))
+    """With rotation and translation: the function sees `scale rotation x + translation` for a position x of the
+    problem, which may have been moved since the rows were registered."""
+
+    rotation: Float[AnyArray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    translation: Float[AnyArray, "3"] = field(default_factory=lambda: np.zeros(3))
+
     observation: Int[AnyArray, "rows pairs cameras"] | None = None
     """Observations that stand for the rows in a problem that is laid out (structure/residual_slots.py)."""
 
@@ -147,13 +157,6 @@ class Residuals(ArrayRecord):
     blocks: tuple[Float[AnyArray, "n numbers"], ...] = ()
     """Values of the unknowns that only residuals have, a row for each camera, or fewer."""
 
-    scale: Float[AnyArray, ""] = field(default_factory=lambda: np.ones(()))
-    """With rotation and translation: functions see `scale rotation x + translation` for a position x of the problem,
-    which may have been moved since they were registered."""
-
-    rotation: Float[AnyArray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    translation: Float[AnyArray, "3"] = field(default_factory=lambda: np.zeros(3))
-
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     """Names of the blocks."""
 
@@ -164,16 +167,25 @@ class Residuals(ArrayRecord):
 
     def moved(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Residuals:
         """Those of a problem whose positions x have become `scale rotation x + translation`."""
-        own, turn = np.asarray(self.scale) / scale, np.asarray(self.rotation) @ rotation.T
-        return replace(self, scale=own, rotation=turn, translation=self.translation - own * turn @ translation)
+        found = []
+        for rows in self.rows:
+            own, turn = np.asarray(rows.scale) / scale, np.asarray(rows.rotation) @ rotation.T
+            back = rows.translation - own * turn @ translation
+            found.append(replace(rows, scale=own, rotation=turn, translation=back))
+        return replace(self, rows=tuple(found))
 
-    def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals:
-        """Those of some of the observations and points of a problem that is laid out."""
+    def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals | None:
+        """Those of some of the observations and points of a problem that is laid out, else none."""
+        if any(rows.observation is None for rows in self.rows):
+            return None
         place = np.where(observations, np.cumsum(observations) - 1, -1)
         found = []
         for rows in self.rows:
             own = place[np.asarray(rows.observation)]
-            rows = replace(rows, observation=own).of((own >= 0).any(axis=(1, 2)))
+            kept = np.flatnonzero((own >= 0).any(axis=(1, 2)))
+            rows = replace(rows, observation=own).of(
+                kept if len(kept) else np.zeros(1, int)
+            )  # arrays must not be empty
             at = rows.of_point()
             if at is not None:
                 index = [*rows.index]

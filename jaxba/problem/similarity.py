@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,23 +41,19 @@ class Similarity(NamedTuple):
 def transformed(
     problem: BundleProblem, by: Similarity, seen: Any = slice(None), placed: Any = slice(None)
 ) -> BundleProblem:
-    """A problem moved with the cameras and points that are chosen. Residuals stay as they are, but those of priors of
-    rotations where it is turned."""
+    """A problem moved with the cameras and points that are chosen. Residuals stay as they are."""
     scale, rotation, shift = by
     cameras, points = (np.array(x, np.float64) for x in (problem.cameras, problem.points))
-    priors, rigs = problem.priors, problem.rigs
+    rigs = problem.rigs
     matrices = rotation_matrices(cameras[seen, :3])
     if (rotation != np.eye(3)).any():
         matrices = matrices @ rotation.T
         cameras[seen, :3] = angle_axis(matrices)
     cameras[seen, 3:6] = scale * cameras[seen, 3:6] - matrices @ shift
     points[placed] = by.points(points[placed])
-    if priors is not None:
-        whitening = np.asarray(priors.position_whitening) / scale
-        priors = replace(priors, positions=by.points(np.asarray(priors.positions)), position_whitening=whitening)
     rigs = rigs if rigs is None or scale == 1.0 else rigs.scaled(scale)
     residuals = None if problem.residuals is None else problem.residuals.moved(*by)
-    return problem.replace(cameras=cameras, points=points, rigs=rigs, priors=priors, residuals=residuals)
+    return problem.replace(cameras=cameras, points=points, rigs=rigs, residuals=residuals)
 
 
 def umeyama(

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.model.linearize import Reference, observation_costs, prior_costs, slot_frames
+from jaxba.model.linearize import Reference, observation_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide
 from jaxba.refinement.midpoints import refine_from_starts
@@ -117,7 +117,7 @@ def comparison(
         layout=layout,
         cameras=cameras,
         cost=cost,
-        terms=jnp.concatenate([terms, *reference.prior_costs]),
+        terms=terms,
         previous=previous,
         step=step,
         options=options,
@@ -163,16 +163,13 @@ def _refined(
 ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
     """The points after embedded iterations, if there are any, and the terms of the cost there."""
     layout, loss, refinement = against.layout, against.options.loss, against.options.refinement
-    of_priors = prior_costs(layout, cameras)
     if not refinement.points:
-        return points, jnp.concatenate([observation_costs(layout, cameras, points, loss), *of_priors])
+        return points, observation_costs(layout, cameras, points, loss)
     arguments = layout, cameras, slot_frames(layout, cameras), points, loss, refinement.points, against.previous
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * predicted)
     if refinement.starts == "step":
-        points, costs = refine_points(*arguments, min_decrease)
-    else:
-        points, costs = refine_from_starts(*arguments, jnp.where(full_step, against.starts, 0), min_decrease)
-    return points, jnp.concatenate([costs, *of_priors])
+        return refine_points(*arguments, min_decrease)
+    return refine_from_starts(*arguments, jnp.where(full_step, against.starts, 0), min_decrease)
 
 
 def select(which: Bool[Array, ""], new: Any, old: Any) -> Any:

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, only_free
-from jaxba.model.priors import costs_of, prior_terms
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
@@ -39,17 +38,12 @@ def refine_cameras(
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient = products[:, :, :width], products[:, :, width]
     unknowns = layout.unknowns
-    for own, slope in prior_terms(unknowns, cameras, alone=True):
-        blocks, gradient = blocks + own, gradient + slope
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     own_cost = lambda costs: sum_over_devices(layout, compute_unfused(each_sum, costs, index=layout.slot_camera))
 
-    def whole_cost(costs: Array, cameras: Array) -> Array:
-        return sum((costs_of(priors, unknowns, cameras) for priors in unknowns.priors), own_cost(costs))
-
-    before = whole_cost(linear.reference.costs, cameras)
+    before = own_cost(linear.reference.costs)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         best, done, attempt_number = carry
@@ -58,7 +52,7 @@ def refine_cameras(
         # the Jacobian, and so the step, is in manifold coordinates
         trial = camera.moved(cameras, unknowns.expanded(step), unknowns)
         costs = observation_costs(layout, trial, points, options.loss)
-        better = (whole_cost(costs, trial) < before) & ~done & keep_focal_signs(cameras, trial)
+        better = (own_cost(costs) < before) & ~done & keep_focal_signs(cameras, trial)
         return jnp.where(better, trial, best), done | better, attempt_number + 1
 
     # a loop instead of unrolled attempts: half as much to compile

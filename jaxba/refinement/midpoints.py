@@ -136,7 +136,7 @@ def refine_from_starts(
     Returns:
         As `refine_points`.
     """
-    choose = lambda *given: choose_starts(layout, *given[:3], loss, given[3])
+    choose = lambda *given: choose_starts(layout, given[0], given[1], given[2], loss, given[3])
     given = cameras, frames, points, previous
     candidates = loops.run_if(starts > 0, choose, given, jnp.stack([points, points]))
 

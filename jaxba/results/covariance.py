@@ -120,7 +120,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     what is observed, as a point that is seen once, has NaN, and a ProblemWarning names it.
 
     Args:
-        problem: a solved problem, with the constants, gauge and priors that were used.
+        problem: a solved problem, with the constants, gauge, priors and other residuals that were used.
         loss: robust loss of the solve; None: squared.
 
     Raises:
@@ -146,6 +146,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     inverse, null = _inverse(system)
     marginal, lost_by_cameras = _marginal(system, inverse, null)
     given_cameras = system.turn @ system.inverse @ system.turn.transpose(0, 2, 1)
+    own = slice(given.num_points)  # without those that stand for rows of residuals
     lost_by_points = system.lost | (~system.seen & free_points)[:, None]
     for matrices, lost in ((marginal, lost_by_points | lost_by_cameras), (given_cameras, lost_by_points)):
         matrices[lost[:, :, None] | lost[:, None]] = np.nan
@@ -164,13 +165,14 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     undetermined: dict[Part, np.ndarray] = {
         "image": np.flatnonzero(has(poses) & seen),
         "lens": np.setdiff1d(np.flatnonzero(has(lenses)), unseen),
-        "point": np.flatnonzero(has(marginal) & system.seen),
+        "point": np.flatnonzero((has(marginal) & system.seen)[own]),
     }
     parts = [part_names(problem.labels, kind, which) for kind, which in undetermined.items() if len(which)]
     if parts:
         note = f"not determined by what is observed, so with NaN for a covariance: {', '.join(parts)}"
         warnings.warn(note, ProblemWarning, stacklevel=2)
-    return Covariance(poses, lenses, marginal, given_cameras, index, of_cameras, changes, rotations, cameras[:, 3:6])
+    of_points = marginal[own], given_cameras[own]
+    return Covariance(poses, lenses, *of_points, index, of_cameras, changes, rotations, cameras[:, 3:6])
 
 
 def _changes(
@@ -189,7 +191,7 @@ def _changes(
         by_extrinsics[:, 3:, :3] = -geometry.cross_matrices(moved)
         start = unknowns.lens_size
         for place, column in enumerate(unknowns.columns):
-            if column >= start:
+            if start <= column < start + EXTRINSICS_SIZE:
                 changes[:, :, POSE_SIZE + place] = by_extrinsics[:, :, column - start]
     back = np.tile(np.eye(6), (len(rotations), 1, 1))
     back[:, 3:, :3] = geometry.cross_matrices(rotations @ offset)  # -(w x R o) = [R o]x w
@@ -217,7 +219,7 @@ class _System(NamedTuple):
     u that are nearly orthogonal and of unit length, or zero where a point is not determined."""
 
     jacobian: Any
-    """Sparse, of two rows for each observation, and then of the priors, by the unknowns of cameras."""
+    """Sparse, of two rows for each observation, by the unknowns of cameras."""
 
     by_point: Any
     """Sparse, of two rows for each observation by u."""
@@ -241,9 +243,10 @@ def _system(
     count: int,
     free_points: Bool[np.ndarray, " points"],
 ) -> _System:
-    from scipy.sparse import csr_matrix, vstack
+    from scipy.sparse import csr_matrix
 
-    mask, points = np.asarray(layout.slot_mask), len(free_points)
+    held, points = np.asarray(layout.observation), len(free_points)
+    mask = held < held.max()  # there is always an empty slot
     point = layout.points[np.asarray(layout.slot_point)[mask]]
     order = np.argsort(point, kind="stable")
     camera, point = np.asarray(layout.slot_camera)[mask][order], point[order]
@@ -270,27 +273,11 @@ def _system(
     place = np.repeat(index[camera], 2, axis=0).ravel()
     used = place >= 0
     at = np.repeat(rows, index.shape[1])
-    parts, height = [csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))], len(rows)
-    for blocks, _ in linear.priors:
-        parts, height = [*parts, _prior_rows(index, count, np.asarray(blocks))], height + index.size
+    jacobian = csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))
     place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
     seen, starts = np.bincount(point, minlength=points) > 0, np.searchsorted(point, np.arange(points + 1))
-    by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (height, 3 * points))
-    return _System(vstack(parts, format="csr"), by_points, inverse, turn, lost, seen, starts)
-
-
-def _prior_rows(index: Int[np.ndarray, "cameras width"], count: int, blocks: Float[np.ndarray, "cameras width width"]):
-    """Roots of the blocks of priors, as rows of the Jacobian."""
-    from scipy.sparse import csr_matrix
-
-    size = np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
-    unit = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(blocks / (unit[:, :, None] * unit[:, None]))
-    values = np.where(values > 1e-14, values, 0.0)
-    roots = np.sqrt(values)[:, :, None] * vectors.transpose(0, 2, 1) * unit[:, None]
-    rows, place = np.indices((index.size, index.shape[1]))[0], np.repeat(index, index.shape[1], axis=0)
-    used = place >= 0
-    return csr_matrix((roots.reshape(place.shape)[used], (rows[used], place[used])), (index.size, count))
+    by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (len(rows), 3 * points))
+    return _System(jacobian, by_points, inverse, turn, lost, seen, starts)
 
 
 def _inverse(system: _System) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n directions"]]:

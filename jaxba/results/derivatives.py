@@ -76,8 +76,8 @@ class SolveInputs(NamedTuple):
     points: Float[AnyArray, "points 3"]
     """Points at the start; the solution depends on the constant ones."""
 
-    positions: Float[AnyArray, "cameras 3"] | None = None
-    """Measured positions, if the problem has priors."""
+    residuals: tuple[tuple[Float[AnyArray, "rows ..."], ...], ...] = ()
+    """For the rows of each residual of the problem besides pixels (`problem.residuals.rows`) their data."""
 
     whitening: Float[AnyArray, "observations 2 2"] | None = None
     """`Sigma^(-1/2)` of each observation (1 / pixels); None: that of the problem, without a derivative."""
@@ -87,8 +87,8 @@ class SolveInputs(NamedTuple):
 
 def inputs_of(problem: BundleProblem) -> SolveInputs:
     """The numbers of a problem that `differentiable_solve` takes."""
-    positions = None if problem.priors is None else problem.priors.positions
-    return SolveInputs(problem.observations, problem.cameras, problem.points, positions, problem.whitening)
+    data = () if problem.residuals is None else tuple(rows.data for rows in problem.residuals.rows)
+    return SolveInputs(problem.observations, problem.cameras, problem.points, data, problem.whitening)
 
 
 def differentiable_solve(
@@ -138,15 +138,17 @@ def differentiable_solve(
 
 def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
     host = lambda x: np.asarray(x, np.float64)
-    priors = problem.priors
-    if priors is not None and inputs.positions is not None:
-        priors = replace(priors, positions=host(inputs.positions))
+    residuals = problem.residuals
+    if residuals is not None:
+        pairs = zip(residuals.rows, inputs.residuals, strict=True)
+        rows = tuple(replace(one, data=tuple(map(host, data))) for one, data in pairs)
+        residuals = replace(residuals, rows=rows)
     return problem.replace(
         cameras=host(inputs.cameras),
         points=host(inputs.points),
         observations=host(inputs.observations),
         whitening=problem.whitening if inputs.whitening is None else host(inputs.whitening),
-        priors=priors,
+        residuals=residuals,
     )
 
 
@@ -249,9 +251,8 @@ def _solve_transposed(
         here = replace(layout, pixels=in_slots(theta.observations))
         if theta.whitening is not None:
             here = replace(here, whitening=in_slots(theta.whitening))
-        if theta.positions is not None:
-            priors = tuple(replace(one, positions=theta.positions) for one in unknowns.priors)
-            here = replace(here, unknowns=replace(unknowns, priors=priors))
+        own = zip(layout.residuals, theta.residuals, strict=True)
+        here = replace(here, residuals=tuple(replace(rows, data=data) for rows, data in own))
         return cost(here, *moved(y, theta), options.loss)
 
     gradient = jax.grad(objective)

@@ -109,7 +109,6 @@ def choose_linear_solver(
             ProblemError,
             rigs=rigs is not None,
             shared_lenses=bool(shared) and options.intrinsics == "free",
-            priors=problem.priors is not None,
             residuals=problem.residuals is not None,
         )
         return options

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-import jax
-import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxba.structure.layout import Layout
@@ -34,11 +32,3 @@ def max_over_devices(layout: Layout, value: Array) -> Array:
     for axis in layout.axes:
         value = lax.pmax(value, axis)
     return value
-
-
-def on_one_device(layout: Layout, values: T) -> T:
-    """The values on the first device and zeros on the others: a term that is no sum over points, before a sum."""
-    for axis in layout.axes:
-        first = lax.axis_index(axis) == 0
-        values = jax.tree.map(lambda x, first=first: jnp.where(first, x, jnp.zeros_like(x)), values)
-    return values

@@ -151,7 +151,8 @@ def build_layout(
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
     Args:
-        problem: a checked problem, `in_frames` if it has rigs, `laid_out` if it has residuals of one's own; host arrays.
+        problem: a checked problem, `in_frames` if it has rigs, `laid_out` if it has other residuals than those of
+            pixels; host arrays.
         options: of the step: the layout has exactly the parts that it needs. If it forms the reduced camera system, it
             lists pairs of observations: `t (t + 1) / 2` of each point with t observations.
         capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.

@@ -89,10 +89,11 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
         observations: its sorted observations, if they are known already.
 
     Returns:
-        The capacity; None for problems with lenses (problem/intrinsics.py), constants, priors or residuals, with more than
-        `MAX_CAMERAS` or `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`.
+        The capacity; None for problems with lenses (problem/intrinsics.py), constants, rigs or other residuals than
+        those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS`, or with more observations or points than
+        `MAX_OBSERVATIONS`.
     """
-    general = problem.lenses is not None or problem.constants is not None or problem.priors is not None
+    general = problem.lenses is not None or problem.constants is not None
     general = general or problem.rigs is not None or problem.residuals is not None
     observations = observations or ObservationOrder.of(problem)
     cameras, points = observations.num_cameras, len(observations.tracks)

@@ -17,7 +17,7 @@ the orthogonal projector P, which averages over the cameras of a lens,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,10 +30,9 @@ from jaxba.problem.frames import free_poses
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, Lenses, lens_size
 from jaxba.problem.labels import part_name
 from jaxba.problem.options import Intrinsics
-from jaxba.problem.priors import Priors
 from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.problem.row_owners import block_groups
 from jaxba.structure.agreement import Agreement
-from jaxba.structure.residual_slots import block_groups
 from jaxba.structure.sharing import Mask, Sharing
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
@@ -61,10 +60,6 @@ class Unknowns(ArrayRecord):
     model: Int[AnyArray, " cameras"]
     """Camera model of each camera, a position in `models`."""
 
-    priors: tuple[Priors, ...]
-    """Priors if there are any, with a row for each camera also of what is known of lenses: a shared lens has its weight
-    in one of them."""
-
     models: tuple[CameraModel, ...] = field(metadata={"static": True})
     """Camera models."""
 
@@ -72,7 +67,7 @@ class Unknowns(ArrayRecord):
     """Whether every observed camera has a lens in common with others."""
 
     columns: tuple[int, ...] = field(metadata={"static": True})
-    """Numbers of a lens, then of extrinsics and of blocks of residuals, that are part of a camera's block, ascending."""
+    """Numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block, ascending."""
 
     lens_size: int = field(metadata={"static": True})
     """Number of all intrinsics of a camera."""
@@ -209,7 +204,6 @@ def unknowns_of(
         free=Mask.of(free.T),
         free_points=Mask(np.append(~held, True)[np.minimum(order, points)], not any_held),
         model=np.pad(model, (0, padding)),
-        priors=_camera_priors(problem, index, seen),
         models=lenses.models,
         all_shared=bool(np.isin(shares.index, shares.owners)[seen].all()),
         columns=columns,
@@ -231,25 +225,6 @@ def _frames(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
     return np.asarray(problem.rigs.frame)
 
 
-def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> tuple[Priors, ...]:
-    """Cameras that nothing sees have no priors: they are not optimised."""
-    priors = problem.priors
-    if priors is None:
-        return ()
-    observed = np.flatnonzero(seen[: len(index)])
-    first = np.zeros(len(index), bool)
-    first[observed[np.unique(index[observed], return_index=True)[1]]] = True
-    seen = seen[: len(index), None, None]
-    whole = replace(
-        priors,
-        position_whitening=np.asarray(priors.position_whitening) * seen,
-        rotation_whitening=np.asarray(priors.rotation_whitening) * seen,
-        lenses=np.asarray(priors.lenses)[index],
-        lens_weight=np.asarray(priors.lens_weight)[index] * first[:, None],
-    )
-    return (whole,)
-
-
 NONE_SHARED = Sharing.of(np.zeros(0, np.int32))
 ALL_FREE = Mask(np.zeros(0, bool), True)
 
@@ -260,7 +235,6 @@ BAL_UNKNOWNS = Unknowns(
     free=ALL_FREE,
     free_points=ALL_FREE,
     model=np.zeros(0, np.int32),
-    priors=(),
     models=(BAL,),
     all_shared=False,
     columns=(0, 1, 2),

@@ -209,8 +209,10 @@ def test_positions_of_other_images_are_left_out_with_a_note(model, tmp_path):
     left = "positions of 6 images that the problem does not have: later0.jpg, later1.jpg, later2.jpg and 3 more"
     with pytest.warns(ProblemWarning, match=f"log.yaml: position_priors: left out {left}"):
         found = constrained(problem, (), None, str(file))
-    assert (found.priors.positions[:5] == centers[:5]).all()
-    np.testing.assert_allclose(found.priors.position_whitening[:, 0, 0], [100, 1e-3, 100, 1e-3, 100, 0])
+    (rows,) = found.residuals.rows
+    position, whitening = rows.data
+    assert (position == centers[:5]).all()
+    np.testing.assert_allclose(whitening[:, 0, 0], [100, 1e-3, 100, 1e-3, 100])
     with pytest.raises(UsageError, match=f"log.yaml: position_priors: {left}"):
         constrained(problem, (), None, str(file), strict=True)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import support
@@ -148,7 +146,6 @@ def test_wrong_values_are_one_line_in_our_own_words(wrong, unchecked):
         lambda: with_lens_priors(problem, {"k1": wrong if wrong != 5 else 0}),
         lambda: Loss(wrong),
         lambda: Loss("huber", wrong if wrong != 5 else -5),
-        lambda: BundleProblem.create(*support.arrays(problem), priors=replace(known().priors, positions=wrong)),
     ]
     for call in calls:
         with pytest.raises(ValueError, match=r"^[^\n]+$") as caught:
@@ -157,6 +154,11 @@ def test_wrong_values_are_one_line_in_our_own_words(wrong, unchecked):
         assert len(text) < 300
         foreign = ("object is not", "could not convert", "inhomogeneous", "broadcast", "unhashable", "array(", "ufunc")
         assert not any(words in text for words in foreign), text
+
+
+def whitening(problem: BundleProblem) -> np.ndarray:
+    """Of the positions that were given last."""
+    return problem.residuals.rows[-1].data[1]
 
 
 def test_standard_deviations_are_one_number_three_or_those_of_each_image():
@@ -169,10 +171,10 @@ def test_standard_deviations_are_one_number_three_or_those_of_each_image():
         (each[:, None], np.tile(each[:, None], (1, 3))),
         (each[:, None] * axes, each[:, None] * axes),
     ]:
-        priors = with_position_priors(problem, centers, stddev=stddev, align=False).priors
-        np.testing.assert_allclose(priors.position_whitening, np.eye(3) / wanted[:, None, :])
-    three = with_position_priors(problem, centers[:3], stddev=axes, images=[0, 1, 2], align=False).priors
-    np.testing.assert_allclose(three.position_whitening[1].diagonal(), 1 / axes)
+        found = with_position_priors(problem, centers, stddev=stddev, align=False)
+        np.testing.assert_allclose(whitening(found), np.eye(3) / wanted[:, None, :])
+    three = with_position_priors(problem, centers[:3], stddev=axes, images=[0, 1, 2], align=False)
+    np.testing.assert_allclose(whitening(three)[1].diagonal(), 1 / axes)
     with pytest.raises(ValueError, match="either a covariance or a stddev"):
         with_position_priors(problem, centers, np.eye(3), stddev=1.0)
     with pytest.raises(ValueError, match="image 1 has more than one measurement"):
@@ -196,39 +198,39 @@ def test_names_of_groups_and_numbers_say_what_of_lenses_is_constant():
 
 def test_methods_refuse_what_they_do_not_support():
     known = with_lens_priors(support.tiny(), {"k1": 0.1})
-    with pytest.raises(ProblemError, match="priors need plain LM, not stba"):
+    with pytest.raises(ProblemError, match="priors and residuals of your own need plain LM, not stba"):
         solve(known, "ceres", SolveOptions(method=make_method("stba")))
 
 
 # Priors
 
 
-def known() -> BundleProblem:
-    """Positions of four images under a robust loss, rotations of all, and lenses that are believed."""
+SPREAD = np.array([0.01, 0.02, 0.03])
+
+
+def measurements() -> tuple[np.ndarray, np.ndarray]:
+    """Positions of four images and rotations of all, with noise."""
     problem, rng = support.tiny(), np.random.default_rng(3)
     centers = geometry.camera_centers(problem.cameras)
-    spread = np.diag([0.01, 0.02, 0.03])
-    problem = with_position_priors(
-        problem,
-        centers[:4] + 0.3 * rng.normal(size=(4, 3)),
-        spread,
-        images=[0, 1, 2, 3],
-        loss=Loss("huber"),
-        align=False,
-    )
-    turned = problem.cameras[:, :3] + 0.05 * rng.normal(size=(6, 3))
+    return centers[:4] + 0.3 * rng.normal(size=(4, 3)), problem.cameras[:, :3] + 0.05 * rng.normal(size=(6, 3))
+
+
+def known() -> BundleProblem:
+    """Positions of four images under a robust loss, rotations of all, and lenses that are believed."""
+    centers, turned = measurements()
+    given = {"images": [0, 1, 2, 3], "align": False}
+    before = with_position_priors(support.tiny(), centers + 1, stddev=1.0, **given)  # of which nothing stays
+    problem = with_position_priors(before, centers, np.diag(SPREAD), loss=Loss("huber"), **given)
     return with_lens_priors(with_rotation_priors(problem, turned, 0.01 * np.eye(3)), {"focal": 20.0, "k1": 0.05})
 
 
 def prior_residuals(problem: BundleProblem) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
-    priors, cameras = problem.priors, np.asarray(problem.cameras)
-    away = geometry.camera_centers(cameras) - priors.positions
-    position = np.einsum("nij,nj->ni", priors.position_whitening, away)
-    turned = (Rotation.from_rotvec(cameras[:, :3]) * Rotation.from_rotvec(priors.rotations).inv()).as_rotvec()
-    rotation = np.einsum("nij,nj->ni", priors.rotation_whitening, turned)
-    lens = priors.lens_weight * (cameras[:, 6:] - priors.lenses)
+    (centers, turned), cameras = measurements(), np.asarray(problem.cameras)
+    position = (geometry.camera_centers(cameras)[:4] - centers) / np.sqrt(SPREAD)
+    rotation = 10 * (Rotation.from_rotvec(cameras[:, :3]) * Rotation.from_rotvec(turned).inv()).as_rotvec()
+    lens = (cameras - support.tiny().cameras)[:, 6:8] / [20.0, 0.05]
     norms = np.sum(position**2, axis=1)
     huber = np.sqrt(np.where(norms > 1, 2 * np.sqrt(norms) - 1, norms))
     return np.concatenate([huber, rotation.ravel(), lens.ravel()])
@@ -236,18 +238,6 @@ def prior_residuals(problem: BundleProblem) -> np.ndarray:
 
 def whole_residuals(problem: BundleProblem) -> np.ndarray:
     return np.concatenate([geometry.residuals(problem).ravel(), prior_residuals(problem)])
-
-
-def test_priors_that_do_not_fit_are_refused_in_one_line():
-    problem = known()
-    parts, priors = support.arrays(problem), problem.priors
-    assert support.same_bits(BundleProblem.create(*parts, priors=priors).priors, priors)
-    names = ("positions", "position_whitening", "rotations", "rotation_whitening")
-    fewer = replace(priors, **{name: getattr(priors, name)[:5] for name in names})
-    with pytest.raises(ProblemError, match=r"positions of priors must have shape \(6, 3\), not \(5, 3\)"):
-        BundleProblem.create(*parts, priors=fewer)
-    with pytest.raises(ProblemError, match="lens_weight of priors must be finite"):
-        BundleProblem.create(*parts, priors=replace(priors, lens_weight=priors.lens_weight * np.nan))
 
 
 @pytest.mark.parametrize(
@@ -339,7 +329,7 @@ def test_the_covariance_of_a_relative_pose_does_not_depend_on_the_gauge():
 
 
 def test_prepare_takes_what_is_constant_and_known():
-    assert prepare(known()).layout.unknowns.priors
+    assert [len(rows.point) for rows in prepare(known()).layout.residuals] == [4, 6, 6]
     assert not prepare(held()).layout.unknowns.free.everywhere
 
 

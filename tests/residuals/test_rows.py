@@ -117,15 +117,20 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
         rows = depth(pose=camera, point=point, image=camera, measured=measured, sigma=0.1)
         found = add(problem, rows, unknowns={"image": start})
         of = lambda c, x, b: b[0] * (pose(c)[0] @ x + pose(c)[1])[2] + b[1]
-        return found, lambda cameras, points, blocks: (
-            (jax.vmap(of)(cameras[camera], points[point], blocks[0][camera]) - measured) / 0.1
+        return (
+            found,
+            lambda cameras, points, blocks: (
+                (jax.vmap(of)(cameras[camera], points[point], blocks[0][camera]) - measured) / 0.1
+            ),
         )
     if kind == "relative":
         first, second = np.array([0, 1, 2, 4]), np.array([1, 2, 3, 0])
         truth = [pose(jnp.asarray(c)) for c in problem.cameras]
         turn = np.array([np.asarray(truth[j][0] @ truth[i][0].T) for i, j in zip(first, second, strict=True)])
         turn = Rotation.from_rotvec(0.02 * rng.standard_normal((4, 3))).as_matrix() @ turn
-        moved = [np.asarray(truth[j][1]) - t @ np.asarray(truth[i][1]) for i, j, t in zip(first, second, turn, strict=True)]
+        moved = [
+            np.asarray(truth[j][1]) - t @ np.asarray(truth[i][1]) for i, j, t in zip(first, second, turn, strict=True)
+        ]
         sigma = np.array([0.01] * 3 + [0.05] * 3)
         found = add(problem, relative_pose(pose=first, pose_2=second, turn=turn, shift=moved, sigma=sigma))
 
@@ -146,8 +151,8 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
     def apart(one, other, clock, measured):
         return 5.0 * (jnp.sum((center(one) - center(other)) ** 2) * (1 + clock[0]) - clock[0] - measured)
 
-    return found, lambda cameras, points, blocks: (
-        jax.vmap(apart, (0, 0, None, 0))(cameras[first], cameras[second], blocks[0][0], measured)
+    return found, lambda cameras, points, blocks: jax.vmap(apart, (0, 0, None, 0))(
+        cameras[first], cameras[second], blocks[0][0], measured
     )
 
 
@@ -175,7 +180,9 @@ def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
     residuals = jax.jit(residuals)
     solution = jaxba.solve(problem, "ceres", jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15)))
     assert solution.initial_cost == pytest.approx(0.5 * np.sum(np.square(residuals(start))), rel=1e-11)
-    found = least_squares(residuals, start, jax.jit(jax.jacfwd(residuals)), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    found = least_squares(
+        residuals, start, jax.jit(jax.jacfwd(residuals)), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     assert solution.final_cost == pytest.approx(found.cost, rel=1e-9)
     after, _ = whole(solution.problem, rows)
     assert 0.5 * np.sum(np.square(residuals(after))) == pytest.approx(solution.final_cost, rel=1e-11)

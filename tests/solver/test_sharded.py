@@ -60,7 +60,7 @@ def compare(problem: BundleProblem, policy: str, rtol: float = 1e-10, **options)
     shared = min(len(one.history.cost), len(several.history.cost))
     assert shared >= 3
     np.testing.assert_allclose(several.history.cost[:shared], one.history.cost[:shared], rtol=rtol)
-    if problem.priors is None:
+    if problem.residuals is None:
         np.testing.assert_allclose(geometry.cost(several.problem), several.final_cost, rtol=max(rtol, 1e-9))
     return several
 
