@@ -35,7 +35,7 @@ NO_MORE_THAN = {
 }
 """Rooms that know less than all that stand before them."""
 
-LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper", "tune")}
+LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper")}
 """Modules of commands that belong to them."""
 
 DOOR = ("jaxba", "jaxba.training.api")

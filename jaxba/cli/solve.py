@@ -155,7 +155,7 @@ class Step:
     auto: full once that pays; on a GPU always."""
 
     settings: Annotated[str | None, "FILE"] = None
-    """YAML file of options of this command, as jaxba-tune writes. The command line wins."""
+    """YAML file of options of this command. The command line wins."""
 
 
 @options

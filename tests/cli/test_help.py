@@ -17,7 +17,6 @@ LINES = {
     "kitti evaluate": 24,
     "paper": 26,
     "train": 52,
-    "tune": 26,
     "view": 30,
 }
 """Most lines of the help of each command on 80 columns."""
