@@ -62,7 +62,6 @@ class Pendulum:
     num_envs: int = dataclasses.field(metadata={"static": True})
     """Number of pendulums."""
 
-    devices = 1
     observation_size = 3
     privileged_size = 0
     action_size = 1

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jaxba.cli import common, processes
+from jaxba.cli import common
 from jaxba.cli.options import options
 from jaxba.runtime.interrupt import Interrupt
-from jaxba.typing import InputError
 
 if TYPE_CHECKING:
     from jaxba.bench.tables import Table
@@ -34,7 +33,7 @@ FILE_WIDTH = 160
 
 
 @options
-class Run:
+class Arguments:
     """What is trained, and where."""
 
     config: Annotated[str | None, "NAME"] = None
@@ -61,12 +60,7 @@ class Run:
 
     resume: bool = False
     """Continue the run in the folder from its last checkpoint. The results are those of an uninterrupted run, bit for
-    bit on the same number of devices."""
-
-
-@options
-class Arguments(Run, processes.Devices):
-    """Options of `jaxba-train`."""
+    bit."""
 
 
 def main() -> None:
@@ -85,18 +79,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _train(args: Arguments, command: str) -> int:
     import jax
 
-    from jaxba.runtime.distributed import MainFailedError, is_main
-
     jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
-    devices = processes.start(args)
-    try:
-        return _run(args, devices, command)
-    except MainFailedError:
-        return common.BAD_INPUT
-    except InputError:  # that all processes have found
-        if is_main():
-            raise
-        return common.BAD_INPUT
+    return _run(args, command)
 
 
 def _prepare(args: Arguments, folder: Path, name: str) -> Any:
@@ -119,22 +103,16 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     return driver.prepare_folder(folder, config, args.resume, overrides)
 
 
-def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
+def _run(args: Arguments, command: str) -> int:
     from jaxba.runtime import process
-    from jaxba.runtime.distributed import is_main, together
     from jaxba.training import driver, task, view
-    from jaxba.training.placement import Placement
 
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
-    config = together(lambda: _prepare(args, folder, name))
-    try:
-        Placement(devices).check(config)
-    except ValueError as error:
-        raise common.UsageError(f"--devices: {error}") from None
+    config = _prepare(args, folder, name)
     common.prepare_process()
-    console = common.console(FILE_WIDTH, markup=False, quiet=not is_main())
-    with process.single_blas_thread(), Interrupt("chunk", graceful=False, announce=is_main()) as interrupt:
+    console = common.console(FILE_WIDTH, markup=False)
+    with process.single_blas_thread(), Interrupt("chunk", graceful=False) as interrupt:
         try:
             with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
                 work = task.build(config, folder, console.print)
@@ -152,7 +130,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
                     console.print(line)
 
             hooks = driver.Hooks(console.print, show, keep, lambda: interrupt.requested)
-            outcome = driver.train(config, work.game, work.evaluate, folder, hooks, devices)
+            outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
             interrupt.graceful = False
         except KeyboardInterrupt:
             console.print(f"interrupted; go on with {_again(folder)}")
@@ -164,7 +142,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return interrupt.status
-        return together(lambda: _finish(folder, work, outcome.best, console, command))
+        return _finish(folder, work, outcome.best, console, command)
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:

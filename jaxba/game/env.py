@@ -29,7 +29,6 @@ from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import Memory, begin, duration, observation_size, observe, record
 from jaxba.damping.guard import action_of, damping_of
 from jaxba.damping.rules import Ceres
-from jaxba.game.devices import all_rows, own_rows
 from jaxba.game.groups import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
@@ -139,14 +138,6 @@ class Game:
     options: StepOptions = field(metadata={"static": True})
     """Of the LM step, those of the agent's configuration included (`AgentConfig.step_options`)."""
 
-    devices: int = field(default=1, metadata={"static": True})
-    """See `protocol.Environment`. Divides the environments of every class."""
-
-    @property
-    def shares(self) -> GameState:
-        """Which parts of the state are divided among devices."""
-        return GameState(True, False)  # pyright: ignore[reportArgumentType]  # a prefix of the tree
-
     @property
     def num_envs(self) -> int:
         """Environments that step together."""
@@ -173,7 +164,7 @@ class Game:
         check_x64(self.banks[0].initial_cost.dtype)
         key, *keys = jax.random.split(key, 1 + len(self.kinds))
         episodes = tuple(
-            jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(own_rows(jax.random.split(k, count), self.devices))
+            jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(jax.random.split(k, count))
             for bank, k, count in zip(self.banks, keys, self.envs, strict=True)
         )
         state = GameState(episodes, key)
@@ -182,7 +173,7 @@ class Game:
     def observations(self, state: GameState) -> Float[Array, "envs features"]:
         """What is observed everywhere, for the next actions."""
         seen = [
-            all_rows(jax.vmap(functools.partial(self._observe, bank))(part), self.devices)
+            jax.vmap(functools.partial(self._observe, bank))(part)
             for bank, part in zip(self.banks, state.episodes, strict=True)
         ]
         return jnp.concatenate(seen)
@@ -224,11 +215,11 @@ class Game:
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
-            own = own_rows((action[start : start + count], jax.random.split(k, count)), self.devices)
+            own = action[start : start + count], jax.random.split(k, count)
             start += count
             play = functools.partial(self._play, kind)
             episodes, step = step_groups(play, episodes, *own, shared=bank)
-            parts.append(all_rows(step, self.devices))
+            parts.append(step)
             after.append(episodes)
         return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
@@ -273,7 +264,7 @@ class Game:
         last quarter."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        rules = [all_rows(jax.vmap(_rule_damping)(part.memory), self.devices) for part in state.episodes]
+        rules = [jax.vmap(_rule_damping)(part.memory) for part in state.episodes]
         rule = jnp.concatenate(rules) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)

@@ -57,12 +57,6 @@ class Environment(Protocol):
         """Numbers of an action, each in (-1, 1)."""
         ...
 
-    @property
-    def devices(self) -> int:
-        """Devices among which the environments are divided, inside `jax.shard_map` (`devices.py`): states hold a
-        device's share, actions and steps are those of all environments. 1 without."""
-        ...
-
     def reset(self, key: Array) -> tuple[Any, Float[Array, "envs features"]]:
         """State and observations of new episodes. The state holds the key of all further random numbers."""
         ...

@@ -48,19 +48,18 @@ class Interrupt:
     status = 0
     """Exit status after the signal that came last; 0 before any."""
 
-    def __init__(self, unit: str = "", *, graceful: bool = False, announce: bool = True) -> None:
+    def __init__(self, unit: str = "", *, graceful: bool = False) -> None:
         """Does nothing yet.
 
         Args:
             unit: what is finished after the first signal, for the message, e.g. `iteration`. Without it, signals that
                 have a handler already are left alone.
             graceful: initial value of the attribute, which can be changed later.
-            announce: whether to print that message.
         """
         self.unit, self.graceful, self.requested = unit, graceful, False
         # signals that the thread and the handler have seen; Python calls the handler once for several signals
         self._received, self._handled = 0, 0
-        self._message = [True] * announce  # empty when the message has been printed
+        self._message = [True]  # empty when the message has been printed
         self._sender: socket.socket | None = None
 
     def __enter__(self) -> Interrupt:

@@ -84,13 +84,7 @@ def make_env(
 
 
 def train(
-    env: PresetGame,
-    steps: int,
-    *,
-    seeds: int = 1,
-    seed: int = 0,
-    folder: StrPath | None = None,
-    verbose: bool = False,
+    env: PresetGame, steps: int, *, seeds: int = 1, seed: int = 0, folder: StrPath | None = None, verbose: bool = False
 ) -> LearnedPolicy:
     """Trains agents by Soft Actor-Critic in one compiled loop; the policy that is best on training scenes.
 

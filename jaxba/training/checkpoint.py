@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba.runtime import distributed
 from jaxba.runtime.atomic import TEMPORARY, atomic_write
 from jaxba.typing import InputError
 
@@ -31,10 +30,9 @@ class TrainError(InputError):
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
-    """Leaves of a tree by path, copied to the host from all devices; random keys as arrays."""
+    """Leaves of a tree by path, copied to the host; random keys as arrays."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    whole = lambda x: np.array(distributed.to_host(x) if isinstance(x, jax.Array) else x)
-    return {_name(path): whole(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
+    return {_name(path): np.array(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
 
 
 def check(arrays: Mapping[str, Any], like: Any) -> None:
@@ -61,7 +59,7 @@ def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
 
     Args:
         arrays: leaves by path.
-        like: see `check`; a `jax.ShapeDtypeStruct` with a sharding says on which devices a leaf lies.
+        like: see `check`.
 
     Raises:
         TrainError: see `check`.
@@ -69,12 +67,7 @@ def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
     check(arrays, like)
 
     def leaf(path: Any, expected: Any) -> Any:
-        value, sharding = arrays[_name(path)], getattr(expected, "sharding", None)
-        new = lambda part: jnp.array(part, copy=True)  # a copy, since training donates its argument
-        if sharding is None or isinstance(expected, jax.Array):
-            value = new(value)
-        else:
-            value = jax.make_array_from_callback(value.shape, sharding, lambda rows: new(value[rows]))
+        value = jnp.array(arrays[_name(path)], copy=True)  # a copy, since training donates its argument
         return jax.random.wrap_key_data(value) if _is_key(expected) else value
 
     return jax.tree_util.tree_map_with_path(leaf, like)

@@ -23,7 +23,7 @@ from jaxba.solver.methods import make_method
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig
 
-MethodName = Literal["lm", "stba", "deeplm", "poba"]
+MethodName = Literal["lm", "stba", "deeplm"]
 
 CLUSTER_CAMERAS = 4
 """Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for

@@ -4,10 +4,7 @@ A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `chec
 state, the best policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that
 can be read, removes from the log what was written after it, and repeats that, with the same numbers.
 
-All agents of a run are trained side by side, in one program over an axis of agents. Several devices divide the agents
-or, if their number is no multiple, the environments (`train_loop.py`). A checkpoint holds whole arrays and can be
-resumed on any number of devices: from the same state, every number is the same to rounding, and bit for bit on as many
-devices as before. Of several processes the first one alone evaluates, reads and writes.
+All agents of a run are trained side by side, in one program over an axis of agents.
 """
 
 from __future__ import annotations
@@ -24,15 +21,13 @@ import numpy as np
 
 from jaxba import settings
 from jaxba.io.files import visible
-from jaxba.runtime import distributed
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.numerics import for_traces
 from jaxba.training import checkpoint
 from jaxba.training.checkpoint import TrainError
 from jaxba.training.config import TrainConfig, load
 from jaxba.training.log import Log, Row
-from jaxba.training.placement import Placement
-from jaxba.training.train_loop import LoopState, agent_shares, run_agents, start_agents, state_shares
+from jaxba.training.train_loop import LoopState, run_agents, start_agents
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -138,7 +133,6 @@ def train(
     evaluate: Callable[[Any], Mapping[str, float]],
     folder: Path,
     hooks: Hooks | None = None,
-    devices: Sequence[jax.Device] | None = None,
 ) -> Outcome:
     """Trains to the end, from the last checkpoint in the folder if there is one.
 
@@ -147,53 +141,35 @@ def train(
         env: a `protocol.Environment`.
         evaluate: metrics of an actor's parameters by their names in the log, deterministic; `SCORE` is one of them.
         folder: see `prepare_folder`.
-        hooks: callbacks; of several processes the first one has them called.
-        devices: the same in all processes; JAX's default device if None.
+        hooks: callbacks.
 
     Raises:
-        TrainError: losses or all transitions are not finite, no checkpoint can be used or written, or the agents and
-            environments cannot be divided among the devices.
-        MainFailedError: the first process has failed, and this is another.
+        TrainError: losses or all transitions are not finite, or no checkpoint can be used or written.
     """
-    run = _Run(config, env, evaluate, folder, hooks or Hooks(), devices or ())
+    run = _Run(config, env, evaluate, folder, hooks or Hooks())
     try:
         return run.finish()
     finally:
-        if run.log is not None:
-            run.log.close()
+        run.log.close()
 
 
 class _Run:
     """A run between two chunks."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        env: Any,
-        evaluate: Any,
-        folder: Path,
-        hooks: Hooks,
-        devices: Sequence[jax.Device],
-    ) -> None:
-        self.config, self.evaluate, self.hooks = config, evaluate, hooks
-        try:
-            self.placement = Placement(devices)
-            self.env = self.placement.on_all(self.placement.divide(config, env))
-        except ValueError as error:
-            raise TrainError(str(error)) from None
+    def __init__(self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks) -> None:
+        self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
         self.folder = folder / CHECKPOINTS
         self.chunk, self.wall_s = 0, 0.0
         self.evaluated = 0  # chunk after which the agents were evaluated last
         self.best: tuple[Best, ...] = ()
         like: Any = jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, self._keys()))
-        like = self.placement.described(like, state_shares(self.env))
-        if distributed.together(lambda: bool(checkpoint.steps(self.folder))):
+        if checkpoint.steps(self.folder):
             self._restore_latest(like)
         else:
             self._begin(like)
         hooks.stage("compiling the training loop")
-        self._compiled = run_agents.lower(config.sac, config.loop, self.env, self.state, self.placement.mesh).compile()
-        self.log = Log(folder, self.chunk, hooks.stage) if distributed.is_main() else None
+        self._compiled = run_agents.lower(config.sac, config.loop, self.env, self.state).compile()
+        self.log = Log(folder, self.chunk, hooks.stage)
 
     def _keys(self) -> Any:
         """Random keys of the agents; scenes have another one."""
@@ -203,17 +179,16 @@ class _Run:
 
     def _begin(self, like: Any) -> None:
         self.hooks.stage("filling the replay buffer")
-        keys = self.placement.spread(self._keys(), agent_shares(self.env))
-        fresh = start_agents(self.config.sac, self.config.loop, self.env, keys, self.placement.mesh)
+        fresh = start_agents(self.config.sac, self.config.loop, self.env, self._keys())
         self.state: LoopState = checkpoint.unpack(
             checkpoint.pack(fresh), like
         )  # the same memory layout as after a checkpoint
 
     def _restore_latest(self, like: Any) -> None:
         """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
-        (self.chunk, self.wall_s, self.evaluated, best), arrays = distributed.together(lambda: self._read_latest(like))
+        (self.chunk, self.wall_s, self.evaluated, best), arrays = self._read_latest(like)
         self.state = checkpoint.unpack(arrays, {"state": like})["state"]
-        if best and distributed.is_main():
+        if best:
             host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
             actors = checkpoint.unpack(arrays, {"best": host})["best"]
             self.best = tuple(Best(_agent(actors, k), agent=k, **one) for k, one in enumerate(best))
@@ -245,7 +220,7 @@ class _Run:
 
     def _save(self) -> None:
         arrays = checkpoint.pack({"state": self.state})
-        distributed.together(lambda: self._write(arrays))
+        self._write(arrays)
 
     def _write(self, arrays: dict[str, np.ndarray]) -> None:
         if self.best:
@@ -270,28 +245,28 @@ class _Run:
         if self.evaluated != self.chunk:  # `chunks` was larger when the run began
             self.hooks.stage("evaluating the last policies")
             actors = self._actors()
-            distributed.together(lambda: self._evaluate(actors))
+            self._evaluate(actors)
         return Outcome(True, self.best, self.state)
 
     def _actors(self) -> list[Any]:
         """Copies of the policies of all agents, to be evaluated."""
-        self.evaluated = self.chunk  # in every process
-        whole = jax.tree.map(distributed.to_host, self.state.learner.actor)
+        self.evaluated = self.chunk
+        whole = jax.tree.map(np.asarray, self.state.learner.actor)
         return [_agent(whole, k) for k in range(self.config.seeds)]
 
     def _advance(self) -> bool:
         """One chunk, its evaluation if one is due, and its rows of the log. Whether the run is to end."""
-        before = [distributed.to_host(x) for x in (self.state.env_steps, self.state.updates)]
+        before = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
         wall, cpu = time.perf_counter(), time.process_time()
         self.state, found = self._compiled(self.env, self.state)
-        means = jax.tree.map(distributed.to_host, found)
+        means = jax.tree.map(np.asarray, found)
         seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
         self.chunk += 1
         self.wall_s += seconds
         bad = np.flatnonzero(~np.all([np.isfinite(means[x]) for x in ("critic_loss", "actor_loss", "q_mean")], axis=0))
         if len(bad):
             raise TrainError(f"chunk {self.chunk} of agent {bad[0] + 1}: the losses are not finite any more")
-        counts = [distributed.to_host(x) for x in (self.state.env_steps, self.state.updates)]
+        counts = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
         if np.any(means["dropped"] >= counts[0] - before[0]):
             raise TrainError(
                 f"chunk {self.chunk}: all transitions hold numbers that are not finite; look at the reward"
@@ -305,7 +280,7 @@ class _Run:
             rows.append({**row, **clocks, **{name: float(value[k]) for name, value in means.items()}})
         due = self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks
         actors = self._actors() if due else []
-        return distributed.together(lambda: self._report(rows, actors))
+        return self._report(rows, actors)
 
     def _report(self, rows: list[Row], actors: list[Any]) -> bool:
         """Writes the rows of a chunk, with the scores of the policies if there are any. Whether the run is to end."""
@@ -315,8 +290,7 @@ class _Run:
                 row |= scores
             seconds = time.perf_counter() - wall
             rows = [{**row, "evaluate_s": seconds} for row in rows]
-        if self.log is not None:
-            self.hooks.rows([self.log.write(row) for row in rows])
+        self.hooks.rows([self.log.write(row) for row in rows])
         return self.hooks.stop()
 
     def _evaluate(self, actors: list[Any]) -> list[dict[str, float]]:

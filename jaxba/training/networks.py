@@ -16,8 +16,6 @@ from flax import linen as nn
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.game.devices import own_rows
-
 LAST_LAYER = 3e-3
 """Bound of the uniform initial weights of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
 
@@ -164,12 +162,10 @@ def log_probability(
 
 
 def sample_action(
-    mean: Float[Array, "*batch actions"], log_std: Float[Array, "*batch actions"], key: Array, devices: int = 1
+    mean: Float[Array, "*batch actions"], log_std: Float[Array, "*batch actions"], key: Array
 ) -> tuple[Float[Array, "*batch actions"], Float[Array, "*batch"]]:
-    """A reparametrised action in (-1, 1) and its log-probability in nats. Of several devices, each has its share of a
-    batch, and the random numbers that belong to it."""
-    shape = mean.shape if devices == 1 else (devices * mean.shape[0], *mean.shape[1:])
-    noise = own_rows(jax.random.normal(key, shape, mean.dtype), devices)
+    """A reparametrised action in (-1, 1) and its log-probability in nats."""
+    noise = jax.random.normal(key, mean.shape, mean.dtype)
     pre_tanh = mean + jnp.exp(log_std) * noise
     return squash(pre_tanh), log_probability(noise, log_std, pre_tanh)
 

@@ -13,8 +13,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.game.devices import own_rows
-
 
 class Transition(NamedTuple):
     """One transition of an environment; leading axes are a batch."""
@@ -69,11 +67,10 @@ def add(buffer: Replay, transitions: Transition) -> Replay:
     )
 
 
-def sample(buffer: Replay, key: Array, batch: int, devices: int = 1) -> Transition:
-    """Transitions drawn uniformly with replacement; zeros from an empty buffer. Of several devices, which hold the same
-    buffer, each gets its share of the batch."""
+def sample(buffer: Replay, key: Array, batch: int) -> Transition:
+    """Transitions drawn uniformly with replacement; zeros from an empty buffer."""
     indices = jax.random.randint(key, (batch,), 0, jnp.maximum(buffer.size, 1), jnp.int32)
-    rows = buffer.rows[own_rows(indices, devices)]
+    rows = buffer.rows[indices]
     actions = buffer.action.shape[0]
     features = (rows.shape[1] - actions - 2) // 2
     observation, action, next_observation, last = jnp.split(

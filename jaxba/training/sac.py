@@ -17,7 +17,6 @@ import optax
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.game import devices as shared
 from jaxba.training import networks
 from jaxba.training.replay import Transition
 
@@ -165,16 +164,13 @@ def act_with_value(
     return action, jnp.mean(values, axis=0), -jnp.exp(learner.log_temperature) * log_prob
 
 
-def update(
-    config: SacConfig, learner: Learner, batch: Transition, devices: int = 1
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Learner, dict[str, Float[Array, ""]]]:
     """One gradient step: critics, then actor, then temperature or value network, then target network.
 
     Args:
         config: static.
         learner: before the step.
         batch: transitions with one leading axis.
-        devices: number of devices, of which each has its share of the batch; gradients are averaged over them.
 
     Returns:
         The new learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)),
@@ -196,7 +192,7 @@ def update(
 
     if config.variant == "twin":
         mean, log_std = actor_network.apply(learner.actor, next_public)
-        next_action, next_log = networks.sample_action(mean, log_std, next_key, devices)
+        next_action, next_log = networks.sample_action(mean, log_std, next_key)
         values = critic_network.apply(learner.target, next_observation, next_action)
         future = jnp.min(values, axis=0) - temperature * next_log
     else:
@@ -207,18 +203,16 @@ def update(
         values = critic_network.apply(params, observation, action)
         return jnp.sum(jnp.mean((values - target_value) ** 2, axis=-1)), jnp.mean(values)
 
-    found = jax.value_and_grad(critic_loss, has_aux=True)(learner.critic)
-    (critic_error, q_mean), gradient = shared.mean(found, devices)
+    (critic_error, q_mean), gradient = jax.value_and_grad(critic_loss, has_aux=True)(learner.critic)
     critic = step("critic", learner.critic, gradient)
 
     def actor_loss(params):
         mean, log_std = actor_network.apply(params, public)
-        chosen, log_prob = networks.sample_action(mean, log_std, policy_key, devices)
+        chosen, log_prob = networks.sample_action(mean, log_std, policy_key)
         soft = jnp.min(critic_network.apply(critic, observation, chosen), axis=0) - temperature * log_prob
         return -jnp.mean(soft), (soft, -jnp.mean(log_prob))
 
     (actor_error, (soft, entropy)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(learner.actor)
-    actor_error, entropy, gradient = shared.mean((actor_error, entropy, gradient), devices)
     actor = step("actor", learner.actor, gradient)
     metrics = {
         "critic_loss": critic_error,
@@ -237,7 +231,7 @@ def update(
         def value_loss(params):
             return jnp.mean((_value(config).apply(params, observation) - soft) ** 2)
 
-        metrics["value_loss"], gradient = shared.mean(jax.value_and_grad(value_loss)(value), devices)
+        metrics["value_loss"], gradient = jax.value_and_grad(value_loss)(value)
         source = value = step("value", value, gradient)
 
     updates = learner.updates + 1

@@ -23,7 +23,6 @@ from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
 from jaxba.game.statistics import paired_ratio
 from jaxba.problem.options import StepOptions
-from jaxba.runtime import distributed
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
 from jaxba.training import checkpoint
 from jaxba.training.checkpoint import TrainError
@@ -149,8 +148,7 @@ def build(
     report: Callable[[str], None] = lambda _: None,
     baselines: Sequence[str] | None = None,
 ) -> Task:
-    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. Of several processes the
-    first one does, for all.
+    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder.
 
     Args:
         config: of the run that the folder belongs to.
@@ -162,11 +160,11 @@ def build(
         ValueError: too few scenes are usable, or another version wrote the files. One line for a person.
         OSError: the folder cannot be written or read.
     """
-    splits = distributed.together(lambda: _splits(config, folder, report))
+    splits = _splits(config, folder, report)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
-    runs = distributed.together(lambda: _baseline_runs(config, folder, game, held_out, report, baselines))
+    runs = _baseline_runs(config, folder, game, held_out, report, baselines)
     return Task(config, game, held_out, runs)
 
 

@@ -3,15 +3,11 @@
 No data leaves the device within a chunk. A chunk compiles once per configuration and environment; the driver evaluates,
 saves checkpoints and logs between chunks.
 
-Several devices either have agents of their own, and nothing to tell each other, or share the environments and the
-batches of all agents. Then every device holds the whole replay buffer, so that a batch is the same for any number of
-devices: a collective for each class of scenes in a vector step and two in an update (`game/devices.py`).
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,11 +15,8 @@ import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.sharding import Mesh
-from jax.sharding import PartitionSpec as P
 from jaxtyping import Float, Int
 
-from jaxba.game.devices import AXIS
 from jaxba.game.protocol import Environment, Step
 from jaxba.runtime.jit import jit
 from jaxba.training import replay as ring
@@ -153,8 +146,7 @@ def run_chunk(
         key, act_key, sample_key = jax.random.split(state.key, 3)
         action, value, bonus = agent.act_with_value(sac, state.learner, state.observation, act_key)
         state, step = _play(env, state._replace(key=key), action)
-        sample = lambda key: ring.sample(state.replay, key, sac.batch, env.devices)
-        learn = lambda learner, key: agent.update(sac, learner, sample(key), env.devices)
+        learn = lambda learner, key: agent.update(sac, learner, ring.sample(state.replay, key, sac.batch))
         keys = jax.random.split(sample_key, loop.updates_per_step)
         learner, learned = jax.lax.scan(learn, state.learner, keys)
         state = state._replace(learner=learner, updates=state.updates + loop.updates_per_step)
@@ -206,49 +198,22 @@ def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
     return jnp.sum(errors) / jnp.sum(known, dtype=jnp.float32)
 
 
-@functools.partial(jit, static_argnames=("sac", "loop", "mesh"))
-def start_agents(
-    sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array, mesh: Mesh | None = None
-) -> LoopState:
+@functools.partial(jit, static_argnames=("sac", "loop"))
+def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
     """`start` for several agents, which share the environment's scenes; the state has a first axis of agents.
 
     Args:
         sac: static.
         loop: static.
-        env: a pytree; divided among the devices of the mesh, or else these have equal shares of the agents.
+        env: a pytree.
         keys: one of each agent.
-        mesh: static; of one axis `devices.AXIS`, or None for one device.
     """
-
-    run = lambda env, keys: jax.vmap(lambda key: start(sac, loop, env, key))(keys)
-    return _spread(run, mesh, agent_shares(env), state_shares(env))(env, keys)
+    return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
 
 
-@functools.partial(jit, static_argnames=("sac", "loop", "mesh"), donate_argnames=("state",))
+@functools.partial(jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
 def run_agents(
-    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState, mesh: Mesh | None = None
+    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
 ) -> tuple[LoopState, dict[str, Float[Array, " agents"]]]:
     """`run_chunk` for the agents of `start_agents`; the state is donated, too."""
-
-    run = lambda env, state: jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)
-    return _spread(run, mesh, state_shares(env), (state_shares(env), agent_shares(env)))(env, state)
-
-
-def _spread(run: Callable[..., Any], mesh: Mesh | None, shares: Any, found: Any) -> Callable[..., Any]:
-    """The function of an environment and something else over a mesh, if there is one."""
-    if mesh is None:
-        return run
-    return jax.shard_map(run, mesh=mesh, in_specs=(P(), shares), out_specs=found, check_vma=False)
-
-
-def agent_shares(env: Environment) -> P:
-    """How arrays with a first axis of agents lie on several devices: divided, unless the environments are."""
-    return P(AXIS) if env.devices == 1 else P()
-
-
-def state_shares(env: Any) -> Any:
-    """The same for the state of `start_agents`, as a prefix of its tree."""
-    if env.devices == 1:
-        return P(AXIS)
-    own = jax.tree.map(lambda divided: P(None, AXIS) if divided else P(), env.shares)
-    return LoopState(P(), P(), own, P(), P(), P(), P())  # pyright: ignore[reportArgumentType]
+    return jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)

@@ -5,13 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import chex
-import jax
 import pytest
 from safetensors import safe_open
 
@@ -150,46 +146,6 @@ from jaxba.training import task
 rollout.LANES, task.BASELINES = groups.GROUP, ("ceres",)
 sys.exit(train.run(sys.argv[1:]))
 """
-
-
-@pytest.mark.slow
-def test_two_processes_of_two_devices_are_one_run(finished, tmp_path):
-    out, quiet = tmp_path / "run", ("Gloo", "proxy")
-    with socket.socket() as probe:
-        probe.bind(("", 0))
-        port = probe.getsockname()[1]
-    options = [*COMMAND, "--out", str(out), "--coordinator", f"localhost:{port}", "--processes", "2", "--devices", "2"]
-    folder = {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
-    run_one = lambda k: subprocess.Popen(
-        [sys.executable, "-c", IN_ANOTHER, *options, "--process", str(k)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **folder},
-    )
-    both = [run_one(k) for k in (1, 0)]
-    try:
-        (nothing, errors), (printed, _) = [one.communicate(timeout=300) for one in both]
-    finally:
-        for one in both:
-            one.kill()
-    assert [one.returncode for one in both] == [0, 0], errors
-    assert "policy.safetensors" in printed
-    assert all(line.startswith("[Gloo]") for line in nothing.splitlines())  # which is C++'s
-    assert [line for line in errors.splitlines() if not any(word in line for word in quiet)] == []
-    assert load_policy(out / "policy.safetensors").config == load_policy(finished / "policy.safetensors").config
-    for ours, theirs in zip(log.read(out), log.read(finished), strict=True):
-        numbers = {name: x for name, x in theirs.items() if name not in CLOCKS and x is not None}
-        assert {name: ours[name] for name in numbers} == pytest.approx(numbers, rel=1e-2, abs=1e-4)
-
-
-def test_devices_and_processes_that_cannot_be_had_are_one_line(capsys, tmp_path):
-    out = ("--out", str(tmp_path / "run"))
-    assert "99 devices asked for" in error_of(capsys, *COMMAND, "--devices", "99", *out)
-    assert "--processes and --process go together" in error_of(capsys, "--processes", "2", *out)
-    named = ("--coordinator", "localhost:1", "--processes", "2", "--process", "0")
-    assert "give one" in error_of(capsys, *named, "--distributed", *out)
-    assert not (tmp_path / "run").exists()
 
 
 # Interruptions
