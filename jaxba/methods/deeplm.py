@@ -86,11 +86,6 @@ def solve_normal(
 
     right = -join(system.gradient, jnp.stack(points.gradient))
     found, iterations = conjugate_gradients(
-        apply,
-        right,
-        precondition,
-        forcing=forcing,
-        tolerance=rule.tolerance,
-        max_iterations=rule.max_iterations,
+        apply, right, precondition, forcing=forcing, tolerance=rule.tolerance, max_iterations=rule.max_iterations
     )
     return *split(found), iterations

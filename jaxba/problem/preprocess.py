@@ -10,10 +10,11 @@ from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, tr
 from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity, transformed
 
-POBA_SIZE, POBA_NOISE, POBA_MIN_DEPTH, POBA_SEED = 100.0, 0.01, 0.1, 38401
-"""Of PoBA's experiments: size of the normalised scene, as in Ceres' `BALProblem::Normalize`; standard deviation of
-translation and point noise; smallest depth of an observation; default seed (its random generator is another one, so the
-same seed gives other numbers here)."""
+SIZE = 100.0
+"""Size of a normalised scene. Source: Ceres `BALProblem::Normalize`."""
+
+MIN_DEPTH = 0.1
+"""Smallest depth of an observation in a scene of that size. Source: rootba's experiments."""
 
 FAR = 10.0
 """Distance of a scene from the origin, relative to its extent, from which it is shifted to the origin to be solved.
@@ -24,7 +25,7 @@ MIN_TRACK = 2
 """Fewest observations that determine a point. Source: rootba, which drops points with fewer."""
 
 
-def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
+def normalize(problem: BundleProblem, size: float = SIZE) -> BundleProblem:
     """The same problem in coordinates in which the points are centred and have a given spread.
 
     A similarity moves the marginal median of the points to the origin and scales their median L1 distance from it to
@@ -77,7 +78,7 @@ def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool
     cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
     points = np.bincount(problem.point_index, minlength=problem.num_points) > 0
     groups = block_groups(problem)
-    for rows in () if problem.residuals is None else problem.residuals.rows:
+    for rows in problem.residuals.rows:
         owners = owners_of(problem, rows, groups)
         for own in owners.cameras:
             cameras[own[own >= 0]] = True
@@ -103,8 +104,8 @@ def perturb(
     """Adds Gaussian noise to the start of a problem; the observations stay.
 
     As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held fixed, then translation
-    noise is added to `t = -R c`. rootba and PoBA add it to the centre c, which has the same distribution, since the
-    noise is isotropic.
+    noise is added to `t = -R c`. rootba adds it to the centre c, which has the same distribution, since the noise is
+    isotropic.
 
     Args:
         problem: the problem to perturb.
@@ -116,7 +117,7 @@ def perturb(
     Raises:
         ProblemError: a sigma is negative or not finite.
 
-    Source: Ceres `BALProblem::Perturb`; PoBA's values are in `poba_start`.
+    Source: Ceres `BALProblem::Perturb`.
     """
     for name, sigma in (("rotation", rotation_sigma), ("translation", translation_sigma), ("point", point_sigma)):
         if not (np.isfinite(sigma) and sigma >= 0):
@@ -135,7 +136,7 @@ def perturb(
     return problem.replace(cameras=cameras, points=points)
 
 
-def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> BundleProblem:
+def drop_invalid(problem: BundleProblem, min_depth: float = MIN_DEPTH) -> BundleProblem:
     """Removes observations of points nearer than `min_depth` (scene units) in front of their camera or behind it.
 
     Points with fewer than `MIN_TRACK` remaining observations are removed, and the others are renumbered in order.
@@ -148,7 +149,7 @@ def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> B
     Raises:
         ProblemError: nothing would be left.
 
-    Source: rootba `BalProblem::filter_obs`, which PoBA uses.
+    Source: rootba `BalProblem::filter_obs`.
     """
     keep = depths(problem) >= min_depth
     point_index = np.asarray(problem.point_index)
@@ -157,18 +158,6 @@ def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> B
     if not keep.any():
         raise ProblemError(f"no point is seen by two cameras from at least {min_depth} away: nothing would be left")
     return problem.subset(keep, points=np.flatnonzero(tracks >= MIN_TRACK))
-
-
-def poba_start(problem: BundleProblem, seed: int | np.random.Generator = POBA_SEED) -> BundleProblem:
-    """The start of PoBA's experiments: normalised to size 100, perturbed with sigma 0.01, depths at least 0.1.
-
-    Raises:
-        ProblemError: as `normalize` and `drop_invalid`.
-
-    Source: Weber et al. 2023, "Power Bundle Adjustment for Large-Scale 3D Reconstruction", and its code.
-    """
-    moved = perturb(normalize(problem), seed, translation_sigma=POBA_NOISE, point_sigma=POBA_NOISE)
-    return drop_invalid(moved, POBA_MIN_DEPTH)
 
 
 def _upper_median(values: np.ndarray) -> np.ndarray:

@@ -26,7 +26,6 @@ SHIPPED = {
     "lm": "jaxba.lm.method:LevenbergMarquardt",
     "stba": "jaxba.methods.stba:StochasticClusters",
     "deeplm": "jaxba.methods.deeplm:GlobalConjugateGradients",
-    "poba": "jaxba.methods.poba:PowerSeries",
 }
 """Where the classes of the package's own methods are."""
 

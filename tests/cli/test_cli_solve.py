@@ -464,9 +464,9 @@ BAD = {
     "lambda that is no number": (lambda tiny: [str(tiny), "--policy", "constant:x"], "positive number"),
     "missing policy": (lambda tiny: [str(tiny), "--policy", "no.safetensors"], "no.safetensors: No such file"),
     "policy that is none": (lambda tiny: [str(tiny), "--policy", str(garbage(tiny))], "not a safetensors file"),
-    "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, poba"),
-    "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
-    "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
+    "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm"),
+    "size of no clusters": (lambda tiny: [str(tiny), "--method", "deeplm:3"], "no clusters"),
+    "solver of a method": (lambda tiny: [str(tiny), "--method", "deeplm", "--linear-solver", "sparse"], "has its own"),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
     "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
     "mixed types of a method": (

@@ -12,7 +12,6 @@ import support
 from support import DAMPINGS, MINIATURES, bal_file, check_step, needs_data, same_bits, start, step
 
 from jaxba import BundleProblem, Loss, StepOptions, lm_step, make_method, read_bal
-from jaxba.methods.poba import PowerSeries
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
 
 pytestmark = pytest.mark.step
@@ -74,12 +73,6 @@ CASES = [
 @pytest.mark.parametrize(("make", "options"), CASES)
 def test_schur_step_equals_dense_normal_equation_step(make, options, damping):
     check_step(make(), options, damping)
-
-
-@pytest.mark.parametrize("damping", [1.0, 100.0])
-def test_a_long_power_series_ends_at_the_dense_step(damping):
-    """It converges for every lambda, the slower the smaller it is."""
-    check_step(support.tiny(), StepOptions(method=PowerSeries(order=300)), damping)
 
 
 # Many problems at once
@@ -195,10 +188,9 @@ def test_a_start_that_is_not_finite_stays_as_it_is():
         ({"linear_solver": "sparse"}, 0.1),
         ({"linear_solver": "implicit", "conjugate_gradients": ConjugateGradients(forcing=0.02)}, 0.02),
         ({"method": make_method("deeplm")}, 1e-3),
-        pytest.param({"method": make_method("poba")}, 0.0, marks=pytest.mark.slow),
         pytest.param({"method": make_method("stba")}, 0.0, marks=pytest.mark.slow),
     ],
-    ids=["explicit", "mixed", "sparse", "implicit", "deeplm", "poba", "stba"],
+    ids=["explicit", "mixed", "sparse", "implicit", "deeplm", "stba"],
 )
 def test_a_step_says_by_which_forcing_term_it_ended(changes, forcing):
     options = StepOptions(**changes)

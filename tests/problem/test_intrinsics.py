@@ -222,7 +222,7 @@ def test_lenses_that_make_no_sense_are_refused(lenses, message):
         BundleProblem.create(*support.arrays(support.tiny()), lenses=lenses)
 
 
-@pytest.mark.parametrize("method", ["stba", "deeplm", "poba"])
+@pytest.mark.parametrize("method", ["stba", "deeplm"])
 def test_other_methods_refuse_shared_lenses(method):
     with pytest.raises(ProblemError, match=f"shared lenses need plain LM, not {method}"):
         solve(shared(), "ceres", method=method)
@@ -268,7 +268,7 @@ def test_padding_leaves_lenses_as_they_are():
     assert table.padding(shared(), solution) == "note: not padded: the problem has shared or partly constant lenses"
 
 
-@pytest.mark.parametrize("method", ["poba", "stba"])
+@pytest.mark.parametrize("method", ["deeplm", "stba"])
 def test_a_step_by_a_method_is_refused_as_it_would_let_cameras_of_a_lens_part(method):
     layout, state = support.start(shared())
     with pytest.raises(ValueError, match=f"shared lenses need plain LM, not {method}"):

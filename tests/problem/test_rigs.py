@@ -275,8 +275,8 @@ def test_rigs_grow_with_their_scene():
 
 def test_what_rigs_do_not_support_is_one_line():
     problem = rigged()
-    with pytest.raises(ProblemError, match="rigs need plain LM, not poba"):
-        solve(problem, "ceres", SolveOptions(method=make_method("poba")))
+    with pytest.raises(ProblemError, match="rigs need plain LM, not deeplm"):
+        solve(problem, "ceres", SolveOptions(method=make_method("deeplm")))
     layout, state = support.start(problem, StepOptions())
     with pytest.raises(ValueError, match="rigs need rotation='manifold'"):
         lm_step(layout, state, jnp.asarray(1e-3), StepOptions())

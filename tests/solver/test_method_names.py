@@ -8,7 +8,8 @@ from typing import get_args
 import pytest
 
 from jaxba import METHODS, Refinement, SolveOptions, StepOptions, make_method, make_policy
-from jaxba.methods.poba import PowerSeries
+from jaxba.methods.deeplm import GlobalConjugateGradients
+from jaxba.problem.options import ConjugateGradients
 from jaxba.solver import methods
 from jaxba.training.config import MethodName
 from jaxba.typing import InputError
@@ -25,14 +26,15 @@ def test_a_training_knows_all_methods_of_the_package():
 
 
 def test_a_package_adds_a_method_by_an_entry_point(monkeypatch):
-    added = EntryPoint("mine", "jaxba.methods.poba:PowerSeries", methods.GROUP)
+    added = EntryPoint("mine", "jaxba.methods.deeplm:GlobalConjugateGradients", methods.GROUP)
     monkeypatch.setattr(methods, "entry_points", lambda group: [added] if group == methods.GROUP else [])
     monkeypatch.setattr(methods, "METHODS", type(METHODS)())
-    assert make_method("mine") == PowerSeries()
-    with pytest.raises(InputError, match="known: lm, stba, deeplm, poba, mine"):
+    assert make_method("mine") == GlobalConjugateGradients()
+    with pytest.raises(InputError, match="known: lm, stba, deeplm, mine"):
         make_method("yours")
 
 
 def test_a_method_without_a_name_is_an_option_of_a_solve():
-    step = SolveOptions(method=PowerSeries(order=3)).step_options(make_policy("ceres"))
-    assert step == StepOptions(method=PowerSeries(order=3), refinement=Refinement())
+    method = GlobalConjugateGradients(ConjugateGradients(max_iterations=3))
+    step = SolveOptions(method=method).step_options(make_policy("ceres"))
+    assert step == StepOptions(method=method, refinement=Refinement())
