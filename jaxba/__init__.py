@@ -35,6 +35,7 @@ from jaxba.lm.method import StepMethod
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
+from jaxba.model.registration import with_residual
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.camera_models import CAMERA_MODELS, CameraModel, register_camera_model
 from jaxba.problem.constants import Constants
@@ -43,10 +44,9 @@ from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
-from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
+from jaxba.problem.preprocess import drop_invalid, normalize, perturb
 from jaxba.problem.residuals import residual
 from jaxba.problem.rigs import Rigs
-from jaxba.residuals.register import with_residual
 from jaxba.results.alternation import solve_and_retriangulate
 from jaxba.results.covariance import Covariance, covariance
 from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
@@ -131,7 +131,6 @@ __all__ = [
     "make_policy",
     "normalize",
     "perturb",
-    "poba_start",
     "prepare",
     "random_scene",
     "random_scene_with_truth",

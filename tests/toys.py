@@ -65,7 +65,6 @@ class Toy:
     hides: bool = dataclasses.field(default=False, metadata={"static": True})
     """Whether only critics see the sign, which then comes last."""
 
-    devices = 1
     observation_size = 2
     action_size = 1
 

@@ -61,11 +61,7 @@ class Job:
 
 
 def run_solver(
-    problem: BundleProblem,
-    source: Source,
-    solver: SolverName,
-    repeat: int,
-    settings: RunSettings,
+    problem: BundleProblem, source: Source, solver: SolverName, repeat: int, settings: RunSettings
 ) -> Record:
     """Solves one problem once, with a Python callback after each iteration, and so with measured times.
 

@@ -107,11 +107,7 @@ class Summary:
     """Device, threads, versions and the like."""
 
 
-def summarize(
-    records: Sequence[Record],
-    tolerance: float = 1e-3,
-    metadata: Mapping[str, Any] | None = None,
-) -> Summary:
+def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapping[str, Any] | None = None) -> Summary:
     """Computes the statistics of all tables.
 
     Args:

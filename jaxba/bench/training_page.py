@@ -44,11 +44,7 @@ RULE = Style(COLOURS[-1], "8px,6px", "circle")
 
 
 def to_html(
-    rows: Sequence[Row],
-    rules: Mapping[str, Any],
-    table: Table,
-    episodes: Trajectories,
-    facts: Mapping[str, str],
+    rows: Sequence[Row], rules: Mapping[str, Any], table: Table, episodes: Trajectories, facts: Mapping[str, str]
 ) -> str:
     """The page.
 

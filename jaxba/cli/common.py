@@ -28,7 +28,6 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable with the folder of compiled programs; `off` disables the cache."""
 
-
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
 
@@ -182,7 +181,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
 
     from jaxba.runtime.compilation import use_cache
     from jaxba.runtime.distrust import programs_folder
-    from jaxba.runtime.user_cache import user_cache
+    from jaxba.runtime.process import user_cache
 
     choice = os.environ.get(CACHE_VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):

@@ -36,12 +36,7 @@ KEYS = {
 
 
 def constrained(
-    problem: BundleProblem,
-    constant: tuple[str, ...],
-    gauge: Gauge | None,
-    file: str | None,
-    *,
-    strict: bool = False,
+    problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None, *, strict: bool = False
 ) -> BundleProblem:
     """The problem with what the options and the file say.
 

@@ -31,14 +31,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.hold import Gauge, hold
 from jaxba.problem.losses import Loss
-from jaxba.problem.options import (
-    ConjugateGradients,
-    Intrinsics,
-    LinearSolverChoice,
-    Preconditioner,
-    Rotation,
-    Scaling,
-)
+from jaxba.problem.options import ConjugateGradients, Intrinsics, LinearSolverChoice, Preconditioner, Rotation, Scaling
 from jaxba.results.alternation import solve_and_retriangulate
 from jaxba.results.covariance import covariance
 from jaxba.runtime.compilation import Compilation
@@ -115,8 +108,8 @@ class Step:
     --refine-points K."""
 
     method: Annotated[str, "NAME"] = DEFAULT_METHOD
-    """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. ddlm, ddlm:16: clusters in
-    parallel. deeplm: conjugate gradients on all variables. poba: a power series."""
+    """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. deeplm: conjugate
+    gradients on all variables."""
 
     refine_points: int | None = None
     """Point iterations after each camera step. Default: those that the policy brings (guarded, bold, learned); none
@@ -390,7 +383,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
-    if args.covariance and problem.constants is None and problem.residuals is None:
+    if args.covariance and problem.constants is None and not problem.residuals:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
     return path, problem
 

@@ -102,9 +102,7 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
     solution = replace(solution, problem=end)
     costs = [solution.initial_cost, solution.final_cost]
-    if (
-        problem.residuals is not None or not (loss or Loss()).trivial
-    ):  # else the residuals' own, in the solve's arithmetic
+    if problem.residuals or not (loss or Loss()).trivial:  # else the residuals' own, in the solve's arithmetic
         costs = [geometry.cost(p) for p in (problem, solution.problem)]
     rms = [np.sqrt(2 * cost / problem.num_observations) for cost in costs]
     # a robust loss may bear a residual that overflows
@@ -156,7 +154,7 @@ def lost_in(problem: BundleProblem, model: bool) -> str:
         "which numbers of a lens are constant": lenses is not None and not np.asarray(lenses.free).all(),
         "which poses and points are constant": problem.constants is not None,
         "rigs": problem.rigs is not None,
-        "priors": problem.residuals is not None,
+        "priors and other residuals": bool(problem.residuals),
         "weights of observations": problem.whitening is not None,
     }
     return ", ".join(what for what, is_lost in lost.items() if is_lost)
@@ -168,7 +166,7 @@ def padding(problem: BundleProblem, solution: Solution) -> str:
         return f"padded to {solution.capacity}"
     if problem.lenses is not None:
         why = "the problem has shared or partly constant lenses"
-    elif problem.constants is not None or problem.residuals is not None or problem.rigs is not None:
+    elif problem.constants is not None or problem.residuals or problem.rigs is not None:
         why = "the problem has constants, priors or rigs"
     elif capacity_of(problem) is None:
         why = "the problem is too large"

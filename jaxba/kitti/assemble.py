@@ -22,13 +22,7 @@ Frames = tuple[int, ...]
 """Frame number of every camera."""
 
 
-def assemble(
-    tracks: Tracks,
-    views: Views,
-    calibration: Calibration,
-    frames: Frames,
-    options: Build,
-) -> BundleProblem:
+def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build) -> BundleProblem:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
     Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical

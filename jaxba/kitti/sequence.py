@@ -53,9 +53,7 @@ class Sequence:
         if len(kept) < 2:
             raise ProblemError(f"{display_name(self.folder)}: {len(kept)} of its frames have a pose, not 2")
         return replace(
-            self,
-            numbers=tuple(self.numbers[at] for at in kept),
-            images=tuple(self.images[at] for at in kept),
+            self, numbers=tuple(self.numbers[at] for at in kept), images=tuple(self.images[at] for at in kept)
         )
 
 

@@ -39,15 +39,7 @@ from jaxba.rotations import left_jacobian, left_jacobian_inverse
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.devices import max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import (
-    as_rows,
-    outer_sum,
-    point_sums,
-    take,
-    take_each,
-    take_rows,
-    tree_sum,
-)
+from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
 
 RotationCoordinates = tuple[Float[Array, "cameras 3 3"], Float[Array, "cameras 3 3"]]
 """Maps of rotation steps, to first order: from coordinates in which damping is diagonal to the manifold, and back."""

@@ -113,11 +113,7 @@ def lm_step(
 
 
 def propose(
-    layout: Layout,
-    state: LMState,
-    damping: Float[Array, ""],
-    options: StepOptions,
-    iteration: int | Int[Array, ""] = 0,
+    layout: Layout, state: LMState, damping: Float[Array, ""], options: StepOptions, iteration: int | Int[Array, ""] = 0
 ) -> Proposal:
     """First part of `lm_step`: linearise and solve the damped system. Arguments as for `lm_step`."""
     _check_lenses(layout, options)

@@ -82,9 +82,7 @@ def frames(cameras: Float[Array, "parameters cameras"], unknowns: Unknowns = BAL
 
 
 def moved(
-    cameras: Float[Array, "parameters cameras"],
-    step: Float[Array, "parameters cameras"],
-    unknowns: Unknowns,
+    cameras: Float[Array, "parameters cameras"], step: Float[Array, "parameters cameras"], unknowns: Unknowns
 ) -> Float[Array, "parameters cameras"]:
     """Cameras after a step, `R <- exp(w) R` for rotations."""
     found = cameras + step

@@ -1,13 +1,16 @@
 """Values and derivatives of residuals of one's own, and their places among the slots of observations.
 
-Functions see poses and points as they were when the residuals were registered (`Residuals.scale`), a row at a time;
-JAX evaluates all rows at once. Derivatives are by forward mode, in the coordinates of the camera Jacobian
-(model/linearize.py). How rows become slots: structure/residual_slots.py.
+Functions see poses and points as they were when the residuals were registered (`Rows.scale`), a row at a time; JAX
+evaluates all rows at once, along the last axis. Derivatives are in the coordinates of the camera Jacobian
+(model/linearize.py), backwards from the few numbers of a row, or forwards where a function cannot be transposed. How
+rows become slots: structure/residual_slots.py.
 """
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,11 +20,13 @@ from jaxtyping import Float
 
 from jaxba.model import camera
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.residuals import POINT, Rows
 from jaxba.problem.row_value import Cameras, value
 from jaxba.problem.safe_math import safe_sqrt
-from jaxba.rotations import rotation_matrix
+from jaxba.runtime.fusion import compute_unfused, fusion_barrier
 from jaxba.structure.layout import Layout
 from jaxba.structure.residual_slots import ResidualSlots
+from jaxba.structure.segment_sums import take_each
 from jaxba.structure.unknowns import Unknowns
 
 ROOT = math.sqrt(2.0)
@@ -38,15 +43,14 @@ class Linear(NamedTuple):
 
 def values(
     rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
-) -> Float[Array, "rows size"]:
+) -> Float[Array, "size rows"]:
     """The residual of every row, whitened by the function, without the loss."""
-    function = lambda *given: _value(rows, unknowns, *given)
-    return jax.vmap(function)(*_gathered(rows, unknowns, cameras, points))
+    return _each(functools.partial(_value, rows, unknowns))(*_gathered(rows, unknowns, cameras, points))
 
 
-def row_costs(rows: ResidualSlots, residual: Float[Array, "rows size"]) -> Float[Array, " rows"]:
+def row_costs(rows: Rows, residual: Float[Array, "size rows"]) -> Float[Array, " rows"]:
     """`rho(|r|^2) / 2` of every row."""
-    squared = jnp.sum(residual * residual, axis=1)
+    squared = jnp.sum(residual * residual, axis=0)
     return 0.5 * (squared if rows.loss.trivial else rows.loss(squared)[0])
 
 
@@ -55,9 +59,9 @@ def add_costs(
 ) -> Float[Array, " slots"]:
     """Costs of slots with those of all rows, whose cameras have equal parts of them."""
     for rows in layout.residuals:
-        own = row_costs(rows, values(rows, layout.unknowns, cameras, points)) / len(rows.cameras)
-        at = jnp.asarray(rows.slots)[:, 0]
-        costs = costs.at[at].add(jnp.broadcast_to(own[:, None], at.shape), mode="drop")
+        own = row_costs(rows.rows, values(rows, layout.unknowns, cameras, points)) / len(rows.cameras)
+        at = jnp.asarray(rows.slots)[0]
+        costs = costs.at[at].add(jnp.broadcast_to(own, at.shape), mode="drop")
     return costs
 
 
@@ -68,20 +72,16 @@ def add_point_terms(
     all rows: of a row without a point only its cost, at the point that stands for it."""
     sums, cost = list(sums), 9 if len(sums) > 1 else 0
     for rows in layout.residuals:
-        at = jnp.asarray(layout.slot_point).at[rows.slots[:, 0, 0]].get(mode="fill", fill_value=layout.num_points)
-        step = lambda d, *given, rows=rows: _value(rows, layout.unknowns, *given, move=d)
-        given = _gathered(rows, layout.unknowns, cameras, points)
-        residual = values(rows, layout.unknowns, cameras, points)
-        sums[cost] = sums[cost].at[at].add(row_costs(rows, residual), mode="drop")
-        if not cost or not rows.has_point:
+        at = jnp.asarray(layout.slot_point).at[rows.slots[0, 0]].get(mode="fill", fill_value=layout.num_points)
+        if not cost or POINT not in rows.rows.residual.unknowns:
+            residual = values(rows, layout.unknowns, cameras, points)
+            sums[cost] = sums[cost].at[at].add(row_costs(rows.rows, residual), mode="drop")
             continue
-        zero = jnp.zeros((len(residual), 3), points.dtype)
-        by_point = jax.vmap(jax.jacfwd(step))(zero, *given)  # [rows, size, 3]
-        slope = _weight(rows, residual)[:, None]
-        terms = [jnp.sum(slope * by_point[..., i] * by_point[..., j], axis=1) for i in range(3) for j in range(i + 1)]
-        terms += [jnp.sum(slope * by_point[..., i] * residual, axis=1) for i in range(3)]
-        for k, term in enumerate(terms):
-            sums[k] = sums[k].at[at].add(term, mode="drop")
+        residual, _, by_point = differentiated(rows, layout.unknowns, cameras, points)
+        weighted = _weight(rows.rows, residual) * by_point  # [size, 3, rows]
+        terms = [jnp.sum(weighted[:, i] * by_point[:, j], axis=0) for i in range(3) for j in range(i + 1)]
+        terms += [*jnp.sum(weighted * residual[:, None], axis=0), row_costs(rows.rows, residual)]
+        sums[:10] = [x.at[at].add(term, mode="drop") for x, term in zip(sums[:10], terms, strict=True)]
     return sums
 
 
@@ -89,70 +89,100 @@ def linearized(
     rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
 ) -> Linear:
     """Residuals and Jacobians of rows, at their slots."""
-    several, width = len(rows.cameras), unknowns.width
-    dtype = cameras.dtype
-    given = _gathered(rows, unknowns, cameras, points)
+    residual, by_step, by_move = differentiated(rows, unknowns, cameras, points)
+    root, several = safe_sqrt(_weight(rows.rows, residual)), len(rows.cameras)
 
-    def at(steps: Array, move: Array, *given: Array) -> tuple[Array, Array]:
-        found = _value(rows, unknowns, *given, steps=steps, move=move)
-        return found, found
-
-    zero = jnp.zeros((len(given[1]), several, width), dtype), jnp.zeros((len(given[1]), 3), dtype)
-    (by_step, by_move), residual = jax.vmap(jax.jacfwd(at, (0, 1), has_aux=True))(*zero, *given)
-    root = safe_sqrt(_weight(rows, residual))
-    odd = rows.size % 2
-
-    def pairs(x: Array) -> Array:  # [rows, size, ...] as [rows, pairs, 2, ...], weighted
-        x = x * root.reshape(-1, *[1] * (x.ndim - 1))
-        x = jnp.pad(x, [(0, 0), (0, odd), *[(0, 0)] * (x.ndim - 2)])
-        return x.reshape(x.shape[0], -1, 2, *x.shape[2:])
+    def pairs(x: Array) -> Array:  # [size, ..., rows] as [pairs, 2, ..., rows], weighted
+        x = jnp.pad(x * root, [(0, rows.rows.size % 2), *[(0, 0)] * (x.ndim - 1)])
+        return x.reshape(-1, 2, *x.shape[1:])
 
     residual, by_step, by_move = pairs(residual), pairs(by_step), pairs(by_move)
-    shape = (*residual.shape[:2], several)
+    shape = rows.slots.shape
     flat = lambda x: jnp.broadcast_to(x, shape).reshape(-1)
+    split = ROOT if several > 1 else 1.0  # of a row of two cameras each has half of the residual
+    own = [flat(residual[:, None, k] * (split / several)) for k in range(2)]
+    by_camera = [[flat(split * by_step[:, k, :, w]) for w in range(unknowns.width)] for k in range(2)]
     if several == 1:
-        own = [flat(residual[:, :, k, None]) for k in range(2)]
-        by_point = [[flat(by_move[:, :, k, None, i]) for i in range(3)] for k in range(2)]
-        scale = 1.0
-    else:
-        own = [flat(residual[:, :, k, None] / ROOT) for k in range(2)]
-        signs = jnp.asarray([ROOT, -ROOT], dtype)
-        by_point = [[flat(signs if i == k else jnp.zeros((), dtype)) for i in range(3)] for k in range(2)]
-        scale = ROOT
-    by_camera = [[flat(scale * by_step[:, :, k, :, w]) for w in range(width)] for k in range(2)]
+        by_point = [[flat(by_move[:, k, None, i]) for i in range(3)] for k in range(2)]
+    else:  # by the variable that splits it
+        signs = jnp.asarray([[ROOT], [-ROOT]], cameras.dtype)
+        by_point = [[flat(signs if i == k else jnp.zeros_like(signs)) for i in range(3)] for k in range(2)]
     return Linear(jnp.asarray(rows.slots).reshape(-1), own, by_camera, by_point)
 
 
-def _weight(rows: ResidualSlots, residual: Array) -> Array:
-    squared = jnp.sum(residual * residual, axis=1)
+def _weight(rows: Rows, residual: Array) -> Array:
+    squared = jnp.sum(residual * residual, axis=0)
     return jnp.ones_like(squared) if rows.loss.trivial else rows.loss(squared)[1]
 
 
-def _gathered(rows: ResidualSlots, unknowns: Unknowns, cameras: Array, points: Array) -> tuple[Any, ...]:
-    """What a row needs of the problem, along a first axis: cameras, their models, the point, and the data."""
-    of_rows = jnp.stack([jnp.asarray(cameras)[:, c].T for c in map(jnp.asarray, rows.cameras)], axis=1)
-    model = jnp.stack([jnp.asarray(unknowns.model)[c] for c in map(jnp.asarray, rows.cameras)], axis=1)
-    data = tuple(jnp.asarray(x, cameras.dtype) for x in rows.data)
-    return of_rows, model, jnp.asarray(points)[:, jnp.asarray(rows.point)].T, *data
+def _each(function: Callable[..., Any]) -> Callable[..., Any]:
+    return jax.vmap(function, in_axes=-1, out_axes=-1)
+
+
+def differentiated(
+    rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
+) -> tuple[Float[Array, "size rows"], Float[Array, "size _ width rows"], Float[Array, "size 3 rows"]]:
+    """The residual of every row, and its Jacobians by steps of its cameras and by its point."""
+
+    def backward(*given: Array) -> tuple[Array, tuple[Array, ...]]:
+        at = lambda *parameters: _value(rows, unknowns, *parameters, *given[4:])
+        residual, pull = jax.vjp(at, *given[:4])
+        return residual, jax.vmap(pull)(jnp.eye(len(residual), dtype=residual.dtype))
+
+    def forward(*given: Array) -> tuple[Array, tuple[Array, ...]]:
+        at = functools.partial(_value, rows, unknowns)
+        return at(*given), jax.jacfwd(at, (0, 1, 2, 3))(*given)
+
+    given = _gathered(rows, unknowns, cameras, points)
+    try:
+        residual, derivatives = _each(backward)(*given)
+    except Exception:  # a loop whose length is not known, or a rule for forward mode alone
+        residual, derivatives = _each(forward)(*given)
+    by_rotation, by_translation, by_numbers, by_point = derivatives
+    # R <- R + [w]x R changes the residual by w . sum of R_j x dr/dR_j over columns j
+    turn = jnp.sum(jnp.cross(given[0][None], by_rotation, axis=2), axis=3)
+    if unknowns.in_rigs:  # R = M R_f and t = M t_f + m, with steps of frames and of M and m
+        place, end = given[4][None], unknowns.lens_size
+        matrix = place[:, :, :9].reshape(1, len(rows.cameras), 3, 3, -1)
+        of_place = turn + jnp.cross(place[:, :, 9:], by_translation, axis=2), by_translation
+        by_numbers = jnp.concatenate([by_numbers[:, :, :end], *of_place, by_numbers[:, :, end + 6 :]], axis=2)
+        turn, by_translation = (jnp.sum(matrix * x[:, :, :, None], axis=2) for x in (turn, by_translation))
+    whole = jnp.concatenate([turn, by_translation, by_numbers], axis=2)
+    return residual, jnp.asarray(unknowns.restricted(whole)), by_point
+
+
+def _gathered(rows: ResidualSlots, unknowns: Unknowns, cameras: Array, points: Array) -> tuple[Array, ...]:
+    """What a row needs of the problem, along the last axis: rotations, translations and numbers of its cameras, the
+    point; in a rig M and M t_f; camera models, and the data."""
+    frames = camera.frames(jnp.asarray(cameras), unknowns)
+    rotation, translation, places = jnp.asarray(frames.rotation), jnp.asarray(frames.translation), []
+    for place in frames.places:
+        matrix = jnp.asarray(place)[:9].reshape(3, 3, -1)
+        shifted = jnp.einsum("ijc,jc->ic", matrix, translation, precision="highest")
+        rotation = jnp.einsum("ijc,jkc->ikc", matrix, rotation, precision="highest")
+        translation, places = shifted + jnp.asarray(place)[9:], [matrix.reshape(9, -1), shifted]
+    table = fusion_barrier(jnp.concatenate([rotation.reshape(9, -1), translation, *places, cameras[POSE_SIZE:]]))
+    index, end = [jnp.asarray(one) for one in rows.cameras], 12 + 12 * len(frames.places)
+    table = jnp.stack([jnp.stack(compute_unfused(take_each, table, one, index=one)) for one in index])
+    model = jnp.stack([jnp.asarray(unknowns.model)[one] for one in index])
+    data = (jnp.moveaxis(jnp.asarray(x, cameras.dtype), 0, -1) for x in rows.rows.data)
+    matrices = table[:, :9].reshape(len(index), 3, 3, -1)
+    point = jnp.stack(take_each(points, jnp.asarray(rows.point)))
+    return matrices, table[:, 9:12], table[:, end:], point, table[:, 12:end], model, *data
 
 
 def _value(
     rows: ResidualSlots,
     unknowns: Unknowns,
-    cameras: Array,
+    rotation: Float[Array, "cameras 3 3"],
+    translation: Float[Array, "cameras 3"],
+    numbers: Float[Array, "cameras numbers"],
+    point: Float[Array, "3"],
+    place: Array,
     model: Array,
-    point: Array,
     *data: Array,
-    steps: Array | None = None,
-    move: Array | None = None,
 ) -> Float[Array, " size"]:
-    """The function at the parameters of one row: cameras [cameras, parameters], after steps [cameras, width], and a
-    point, after a move."""
-    columns = cameras.T
-    if steps is not None:
-        columns = camera.moved(columns, unknowns.expanded(steps.T), unknowns)
-    angle_axis, translation = camera.poses(columns, unknowns)
-    lenses = columns[POSE_SIZE : POSE_SIZE + unknowns.lens_size].T
-    given = Cameras(jnp.moveaxis(rotation_matrix(angle_axis), 2, 0), translation.T, lenses, model, unknowns.models)
-    blocks = [columns[start:end].T for start, end in rows.places]
-    return value(rows, given, point if move is None else point + move, blocks, data)
+    """The function at one row."""
+    given = Cameras(rotation, translation, numbers[:, : unknowns.lens_size], model, unknowns.models)
+    blocks = [numbers[:, max(0, first - POSE_SIZE) : max(0, last - POSE_SIZE)] for first, last in rows.places]
+    return value(rows.rows, given, point, blocks, data)

@@ -39,8 +39,8 @@ class ColmapProblem:
         Raises:
             ProblemError: the problem has covariances, lenses, constants, priors or rigs.
         """
-        parts = problem.whitening, problem.lenses, problem.constants, problem.residuals, problem.rigs
-        if any(part is not None for part in parts):
+        parts = problem.whitening, problem.lenses, problem.constants, problem.rigs
+        if problem.residuals or any(part is not None for part in parts):
             raise ProblemError("Ceres as a peer takes no covariances, lenses, constants, priors or rigs")
         self.start = problem
         self.poses, self.lenses, self.points = _parameters(problem)

@@ -80,8 +80,8 @@ class BundleProblem(ArrayRecord):
     rigs: Rigs | None = None
     """Cameras that move together; None: every camera has a pose of its own."""
 
-    residuals: Residuals | None = None
-    """Residuals besides those of pixels: one's own (`jaxba.with_residual`) and priors; None: there are none."""
+    residuals: Residuals = field(default_factory=Residuals)
+    """Residuals besides those of pixels: one's own (`jaxba.with_residual`) and priors."""
 
     labels: Labels | None = field(default=None, metadata={"host": True})
     """What the file calls images, lenses and points; None if nothing does."""
@@ -151,8 +151,10 @@ class BundleProblem(ArrayRecord):
     def __repr__(self) -> str:
         arrays = ("cameras", "points", "observations")
         counts = [f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays]
-        parts = ("whitening", "lenses", "constants", "rigs", "residuals", "labels")
-        return f"BundleProblem({', '.join([*counts, *(name for name in parts if getattr(self, name) is not None)])})"
+        parts = ("whitening", "lenses", "constants", "rigs", "labels")
+        own = [f"{len(rows)} rows of {rows.residual.name}" for rows in self.residuals.rows]
+        found = [*counts, *(name for name in parts if getattr(self, name) is not None), *own]
+        return f"BundleProblem({', '.join(found)})"
 
     @property
     def num_cameras(self) -> int:
@@ -196,8 +198,7 @@ class BundleProblem(ArrayRecord):
         if points is not None:
             index = np.searchsorted(points, found.point_index).astype(np.int32)
             found = replace(found, points=np.asarray(self.points)[points], point_index=index, labels=None)
-            own = None if self.residuals is None else self.residuals.of(np.asarray(observations), points)
-            found = replace(found, residuals=own)
+            found = replace(found, residuals=self.residuals.of(np.asarray(observations), points))
         if cameras is None:
             return found
         return replace(
@@ -206,7 +207,7 @@ class BundleProblem(ArrayRecord):
             camera_index=np.searchsorted(cameras, found.camera_index).astype(np.int32),
             lenses=None if self.lenses is None else self.lenses.of(cameras),
             rigs=None if self.rigs is None else self.rigs.of(cameras),
-            residuals=None,
+            residuals=Residuals(),
             labels=None,
         )
 

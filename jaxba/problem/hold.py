@@ -20,6 +20,7 @@ from jaxba.problem.checks import shown
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.residuals import Residuals
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
@@ -101,7 +102,7 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    scaled = fixed_freedoms(problem.replace(constants=None, residuals=None)) > 0  # by rigs alone
+    scaled = fixed_freedoms(problem.replace(constants=None, residuals=Residuals())) > 0  # by rigs alone
     if fixed_freedoms(problem) == SIMILARITY:
         note = f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already"
         warnings.warn(note, ProblemWarning, stacklevel=2)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxba.problem.alignment import aligned
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -19,7 +19,7 @@ from jaxba.problem.geometry import rotation_matrices
 from jaxba.problem.hold import every_lens, number_columns, positions_of
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
-from jaxba.problem.residuals import Residuals, Rows, residual
+from jaxba.problem.residuals import Rows, residual
 from jaxba.problem.row_value import AXES
 
 LEAST_VARIANCE = 1e-200
@@ -65,7 +65,7 @@ def with_position_priors(
     if not isinstance(loss, Loss | None):
         raise ValueError(f"loss must be a jaxba.Loss, not {shown(loss)}")
     if align:
-        if problem.constants is not None or problem.residuals is not None:
+        if problem.constants is not None or problem.residuals:
             raise ProblemError("an alignment would move what is constant or measured: align first, or align=False")
         problem = aligned(problem, measured, covariances, at)
     rows = position_prior(pose=at, position=measured, whitening=roots)
@@ -139,23 +139,12 @@ def lens_prior(lens, *, mean, weight):
 
 def _with(problem: BundleProblem, rows: Rows) -> BundleProblem:
     """The problem with rows of a prior in place of earlier ones of the same cameras or lenses."""
-    known, kept = problem.residuals or Residuals(), []
+    known, kept = problem.residuals, []
     for one in known.rows:
         if one.residual == rows.residual:
             one = one.of(~np.isin(one.index[0], rows.index[0]))
         kept += [one] if len(one) else []
     return problem.replace(residuals=replace(known, rows=(*kept, rows)))
-
-
-def positions_of_priors(
-    problem: BundleProblem,
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """Images with measured positions, these positions, and their `Sigma^(-1/2)`."""
-    rows = [one for one in (problem.residuals or Residuals()).rows if one.residual == position_prior]
-    if not rows:
-        return np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3))
-    images, places, roots = zip(*((one.index[0], *one.data) for one in rows), strict=True)
-    return np.concatenate(images), np.concatenate(places), np.concatenate(roots)
 
 
 def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str] | None) -> np.ndarray:

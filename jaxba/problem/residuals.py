@@ -67,17 +67,17 @@ class Residual:
                 raise ValueError(f"residual {self.name} {what} {min(found)}; its parameters: {', '.join(names)}")
         given = [np.atleast_1d(plain_array(f"{x} of {self.name}", columns[x])) for x in self.unknowns]
         count = max(map(len, given))
-        index = tuple(
-            indices(f"{x} of {self.name}", np.broadcast_to(one, count) if one.shape == (1,) else one, 2**31 - 1, count)
-            for x, one in zip(self.unknowns, given, strict=True)
-        )
-        data = []
+        index, data = [np.broadcast_to(one, count) if one.shape == (1,) else one for one in given], []
+        for x, one in zip(self.unknowns, index, strict=True):
+            if one.shape != (count,) or one.dtype.kind not in "iu":
+                raise ValueError(f"{x} of {self.name} must be a vector of {count} integers, not {shown(columns[x])}")
         for x in self.data:
             value = real_numbers(f"{x} of {self.name}", columns[x])
             if not np.isfinite(value).all():
                 raise ValueError(f"{x} of {self.name} must be finite")
-            data.append(value if value.shape[:1] == (count,) else np.broadcast_to(value, (count, *value.shape)))
-        return Rows(index, tuple(data), residual=self)
+            own = value.shape[1:] if value.shape[:1] in ((1,), (count,)) else value.shape
+            data.append(np.broadcast_to(value, (count, *own)))
+        return Rows(tuple(index), tuple(data), residual=self)
 
 
 def residual(function: Callable[..., Any]) -> Residual:
@@ -120,8 +120,8 @@ class Rows(ArrayRecord):
     rotation: Float[AnyArray, "3 3"] = field(default_factory=lambda: np.eye(3))
     translation: Float[AnyArray, "3"] = field(default_factory=lambda: np.zeros(3))
 
-    observation: Int[AnyArray, "rows pairs cameras"] | None = None
-    """Observations that stand for the rows in a problem that is laid out (structure/residual_slots.py)."""
+    observation: Int[AnyArray, "_ _ _"] = field(default_factory=lambda: np.zeros((0, 0, 0), np.int32))
+    """Observations that stand for the rows, once the problem is laid out (structure/residual_slots.py)."""
 
     residual: Residual = field(metadata={"static": True}, kw_only=True)
     """The function."""
@@ -135,15 +135,17 @@ class Rows(ArrayRecord):
     def __len__(self) -> int:
         return len(self.index[0])
 
+    @property
+    def point(self) -> Int[np.ndarray, " rows"]:
+        """Point of each row, -1 without one."""
+        of = dict(zip(self.residual.unknowns, self.index, strict=True))
+        return np.asarray(of.get(POINT, np.full(len(self), -1)))
+
     def of(self, kept: Int[np.ndarray, " kept"] | Bool[np.ndarray, " rows"]) -> Rows:
         """Some of the rows."""
-        observation = None if self.observation is None else np.asarray(self.observation)[kept]
         index, data = (tuple(np.asarray(x)[kept] for x in part) for part in (self.index, self.data))
+        observation = np.asarray(self.observation)[kept] if len(self.observation) else self.observation
         return replace(self, index=index, data=data, observation=observation)
-
-    def of_point(self) -> int | None:
-        """Position of the point among the unknowns."""
-        return self.residual.unknowns.index(POINT) if POINT in self.residual.unknowns else None
 
 
 @register_pytree
@@ -160,6 +162,9 @@ class Residuals(ArrayRecord):
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     """Names of the blocks."""
 
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
     @property
     def sizes(self) -> tuple[int, ...]:
         """Numbers in a row of each block."""
@@ -169,51 +174,43 @@ class Residuals(ArrayRecord):
         """Those of a problem whose positions x have become `scale rotation x + translation`."""
         found = []
         for rows in self.rows:
-            own, turn = np.asarray(rows.scale) / scale, np.asarray(rows.rotation) @ rotation.T
+            own, turn = np.asarray(rows.scale / scale), np.asarray(rows.rotation) @ rotation.T
             back = rows.translation - own * turn @ translation
             found.append(replace(rows, scale=own, rotation=turn, translation=back))
         return replace(self, rows=tuple(found))
 
-    def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals | None:
-        """Those of some of the observations and points of a problem that is laid out, else none."""
-        if any(rows.observation is None for rows in self.rows):
-            return None
-        place = np.where(observations, np.cumsum(observations) - 1, -1)
-        found = []
+    def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals:
+        """Those of some of the observations and points of a problem that is laid out; of others none."""
+        place, found = np.where(observations, np.cumsum(observations) - 1, -1), []
         for rows in self.rows:
-            own = place[np.asarray(rows.observation)]
-            kept = np.flatnonzero((own >= 0).any(axis=(1, 2)))
-            rows = replace(rows, observation=own).of(
-                kept if len(kept) else np.zeros(1, int)
-            )  # arrays must not be empty
-            at = rows.of_point()
-            if at is not None:
-                index = [*rows.index]
-                index[at] = np.searchsorted(points, index[at]).astype(np.int32)
-                rows = replace(rows, index=tuple(index))
-            found.append(rows)
-        return replace(self, rows=tuple(found))
+            if len(rows.observation):
+                own = place[np.asarray(rows.observation)]
+                kept = np.flatnonzero((own >= 0).any(axis=(1, 2)))
+                rows = replace(rows, observation=own).of(kept if len(kept) else np.zeros(1, int))  # never empty
+                pairs = zip(rows.residual.unknowns, rows.index, strict=True)
+                index = (np.searchsorted(points, i).astype(np.int32) if name == POINT else i for name, i in pairs)
+                found.append(replace(rows, index=tuple(index)))
+        return replace(self, rows=tuple(found)) if found else Residuals()
 
 
-def with_rows(
-    residuals: Residuals | None, rows: Rows, unknowns: dict[str, Any], counts: dict[str, int], where: str = ""
-) -> Residuals:
+def with_rows(residuals: Residuals, rows: Rows, unknowns: dict[str, Any], counts: dict[str, int]) -> Residuals:
     """Residuals with other rows and new blocks, of a problem with so many cameras, lenses and points (by their names).
 
     Raises ValueError: a block is missing, there already, or no matrix of finite numbers; or an index is out of range.
     """
-    residuals = residuals or Residuals()
-    blocks = dict(zip(residuals.names, residuals.blocks, strict=True))
-    for name, value in unknowns.items():
-        if name in counts or name in blocks or name.endswith(SECOND):
-            raise ValueError(f"unknown {name} is there already" if name in blocks else f"no block may be named {name}")
-        blocks[name] = real_numbers(f"unknown {name}", value)
-        if blocks[name].ndim != 2 or not blocks[name].size or not np.isfinite(blocks[name]).all():
-            raise ValueError(f"unknown {name} must have finite numbers of shape (n, numbers), not {shown(value)}")
-    counts = counts | {name: len(block) for name, block in blocks.items()}
-    for name, index in zip(rows.residual.unknowns, rows.index, strict=True):
-        base = name.removesuffix(SECOND)
+    blocks, name = dict(zip(residuals.names, residuals.blocks, strict=True)), rows.residual.name
+    for own, value in unknowns.items():
+        if own in counts or own in blocks or own.endswith(SECOND):
+            raise ValueError(f"a new unknown may not be named {own}")
+        blocks[own] = real_numbers(f"unknown {own}", value)
+        if blocks[own].ndim != 2 or not blocks[own].size or not np.isfinite(blocks[own]).all():
+            raise ValueError(f"unknown {own} must have finite numbers of shape (n, numbers), not {shown(value)}")
+    counts = counts | {own: len(block) for own, block in blocks.items()}
+    index = []
+    for own, given in zip(rows.residual.unknowns, rows.index, strict=True):
+        base = own.removesuffix(SECOND)
         if base not in counts:
-            raise ValueError(f"{name} of residual {rows.residual.name} has no start: give unknowns={{'{base}': array}}")
-        indices(f"{name} of {rows.residual.name}", index, counts[base], len(rows))
+            raise ValueError(f"{own} of residual {name} has no start: give unknowns={{'{base}': array}}")
+        index.append(indices(f"{own} of {name}", given, counts[base], len(rows)))
+    rows = replace(rows, index=tuple(index))
     return replace(residuals, rows=(*residuals.rows, rows), blocks=tuple(blocks.values()), names=tuple(blocks))

@@ -28,8 +28,6 @@ def changes_by_similarity(
     """For each residual besides those of pixels the derivatives of its numbers by a rotation of the scene about its
     middle, a translation in extents, and the scale, as shares of their largest derivative by one of the row's poses or
     its point in the same units."""
-    if problem.residuals is None:
-        return []
     groups = block_groups(problem)
     with numerics(np.float64):
         pairs = [(rows, owners_of(problem, rows, groups)) for rows in problem.residuals.rows]
@@ -44,7 +42,6 @@ def _changes(
     middle: Float[np.ndarray, "3"],
     extent: float,
 ) -> Float[np.ndarray, "numbers 7"]:
-    assert problem.residuals is not None
     own, lenses = np.maximum(np.stack(cameras, axis=1), 0), problem.lenses
     at, shape = np.asarray(problem.cameras, np.float64)[own.ravel()], own.shape
     models = (BAL,) if lenses is None else lenses.models

@@ -8,100 +8,73 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Rows
+from jaxba.problem.residuals import LENS, POINT, SECOND, Rows
 
 
 class Owners(NamedTuple):
     """Which cameras and point stand for each row of a residual."""
 
-    cameras: list[Int[np.ndarray, " rows"]]  # -1 for some camera that sees the point
+    cameras: list[Int[np.ndarray, " rows"]]  # one or two; -1 for some camera that sees the point
     point: Int[np.ndarray, " rows"]  # -1 for none
 
 
 def block_groups(problem: BundleProblem) -> list[Int[np.ndarray, " cameras"]]:
-    """For each block of residuals the row that each camera has, negative and different where it has none.
-
-    Raises:
-        ProblemError: a camera would have two rows of one block.
-    """
-    if problem.residuals is None:
-        return []
-    return [_groups(problem, name) for name in problem.residuals.names]
-
-
-def _groups(problem: BundleProblem, name: str) -> Int[np.ndarray, " cameras"]:
-    assert problem.residuals is not None
-    count = problem.num_cameras
-    if len(problem.residuals.blocks[problem.residuals.names.index(name)]) == count:
-        return np.arange(count)
-    found = -1 - np.arange(count)
-    for rows in problem.residuals.rows:
-        for place, own in enumerate(rows.residual.unknowns):
-            if own.removesuffix(SECOND) != name:
-                continue
-            camera, index = _named_camera(problem, rows, own.removeprefix(name)), np.asarray(rows.index[place])
-            known = camera >= 0
-            found[camera[known]] = index[known]
-            other = np.flatnonzero(found[camera[known]] != index[known])
-            if other.size:
-                which = camera[known][other[0]]
-                raise ProblemError(f"camera {which} has two rows of the unknown {name}: it needs one for each camera")
+    """For each block of residuals the row that each camera has, negative and different where it has none. Raises
+    ProblemError: see `owners_of`."""
+    residuals, count, found = problem.residuals, problem.num_cameras, []
+    for name, block in zip(residuals.names, residuals.blocks, strict=True):
+        group = np.arange(count) if len(block) == count else -1 - np.arange(count)
+        for rows in residuals.rows if len(block) < count else ():
+            for own, index in zip(rows.residual.unknowns, rows.index, strict=True):
+                if own.removesuffix(SECOND) == name:
+                    camera = _named_camera(problem, rows, own.removeprefix(name))
+                    known = camera >= 0
+                    group[camera[known]] = index[known]
+                    other = camera[known][group[camera[known]] != index[known]]
+                    if other.size:
+                        raise ProblemError(f"camera {other[0]} has two rows of the unknown {name}: give each its own")
+        found.append(group)
     return found
 
 
 def _named_camera(problem: BundleProblem, rows: Rows, ending: str) -> Int[np.ndarray, " rows"]:
     """The camera of each row that a pose, a lens or a block with a row for each camera names; -1 for none."""
-    residuals = problem.residuals
-    assert residuals is not None
-    lengths = dict(zip(residuals.names, map(len, residuals.blocks), strict=True))
+    residuals, count = problem.residuals, problem.num_cameras
+    lens = np.arange(count) if problem.lenses is None else np.asarray(problem.lenses.index)
+    first = np.full(lens.max(initial=0) + 1, -1)
+    first[lens[::-1]] = np.arange(count)[::-1]
+    shared = {name for name, block in zip(residuals.names, residuals.blocks, strict=True) if len(block) < count}
     found = np.full(len(rows), -1)
     for name, index in zip(rows.residual.unknowns, rows.index, strict=True):
         base = name.removesuffix(SECOND)
-        if (SECOND if name.endswith(SECOND) else "") != ending or base == POINT:
+        if name != base + ending or base == POINT or base in shared:
             continue
-        if base == LENS and problem.lenses is not None:
-            lens = np.asarray(problem.lenses.index)
-            first = np.full(len(problem.lenses.free), -1)
-            first[lens[::-1]] = np.arange(len(lens))[::-1]
-            camera = np.where(found >= 0, found, first[index])
-            agrees = lens[camera] == index
-        elif base in (POSE, LENS) or lengths[base] == problem.num_cameras:
-            camera = np.asarray(index)
-            agrees = (found < 0) | (found == camera)
-        else:
-            continue
-        bad = np.flatnonzero(~agrees)
+        camera = np.where(found >= 0, found, first[index]) if base == LENS else np.asarray(index)
+        bad = np.flatnonzero((lens[camera] != index) if base == LENS else (found >= 0) & (found != camera))
         if bad.size:
-            at = f"row {bad[0]} of residual {rows.residual.name}"
-            raise ProblemError(f"{at}: {name} {index[bad[0]]} is not of camera {found[bad[0]]}, whose pose it has")
+            where = f"row {bad[0]} of residual {rows.residual.name}"
+            raise ProblemError(f"{where}: {name} {index[bad[0]]} is not that of its camera, {found[bad[0]]}")
         found = camera
     return found
 
 
 def owners_of(problem: BundleProblem, rows: Rows, groups: list[Int[np.ndarray, " cameras"]]) -> Owners:
-    """Cameras and points that stand for rows.
+    """Cameras and points that stand for rows, for the `block_groups` of the problem.
 
     Raises:
-        ProblemError: unknowns of a row are not of one camera, or a row has more than this can lay out.
+        ProblemError: unknowns of a row are not of one camera, or a row has more than can be laid out.
     """
-    names, residuals = rows.residual.unknowns, problem.residuals
-    assert residuals is not None
-    at = rows.of_point()
-    point = np.full(len(rows), -1) if at is None else np.asarray(rows.index[at])
-    cameras = []
-    for ending in dict.fromkeys(SECOND if name.endswith(SECOND) else "" for name in names if name != POINT):
+    names, cameras, blocks = rows.residual.unknowns, [], problem.residuals.names
+    for ending in dict.fromkeys(SECOND * name.endswith(SECOND) for name in names if name != POINT):
         camera = _named_camera(problem, rows, ending)
         for name, index in zip(names, rows.index, strict=True):
-            base = name.removesuffix(SECOND)
-            if base in residuals.names and name == base + ending:
-                group = groups[residuals.names.index(base)]
-                first = np.full(group.max(initial=-1) + 2, -1)
-                named = np.flatnonzero(group >= 0)[::-1]
-                first[group[named]] = named
-                camera = np.where(camera >= 0, camera, first[np.minimum(index, len(first) - 1)])
-                if (camera < 0).any():
-                    raise ProblemError(f"no residual says which cameras have row {index.min()} of the unknown {base}")
+            if name.removesuffix(ending) in blocks and (camera < 0).any():
+                group = groups[blocks.index(name.removesuffix(ending))]
+                holds = group[:, None] == index
+                camera = np.where((camera < 0) & holds.any(axis=0), holds.argmax(axis=0), camera)
+        if (camera < 0).any():
+            raise ProblemError(f"residual {rows.residual.name}: no residual says which cameras have its unknowns")
         cameras.append(camera)
-    if len(cameras) == 2 and at is not None:
+    if len(cameras) == 2 and POINT in names:
         raise ProblemError(f"residual {rows.residual.name}: two cameras and a point in one row are not supported")
-    return Owners(cameras or [np.full(len(rows), -1)], point)
+    return Owners(cameras or [np.full(len(rows), -1)], rows.point)

@@ -52,8 +52,7 @@ def transformed(
     cameras[seen, 3:6] = scale * cameras[seen, 3:6] - matrices @ shift
     points[placed] = by.points(points[placed])
     rigs = rigs if rigs is None or scale == 1.0 else rigs.scaled(scale)
-    residuals = None if problem.residuals is None else problem.residuals.moved(*by)
-    return problem.replace(cameras=cameras, points=points, rigs=rigs, residuals=residuals)
+    return problem.replace(cameras=cameras, points=points, rigs=rigs, residuals=problem.residuals.moved(*by))
 
 
 def umeyama(

@@ -42,7 +42,6 @@ NEAR_CONVERGENCE = 1e-3
 """Predicted decrease, relative to the cost, below which points are refined from both of their starts, which doubles the
 time. Measured: in earlier iterations it brings nothing more."""
 
-
 COST_ROUNDING = 8.0
 """Rounding error of a cost in machine epsilons, relative to the cost: 1e-6 in float32, which was measured on real
 problems, and 2e-15 in float64."""

@@ -87,7 +87,7 @@ class SolveInputs(NamedTuple):
 
 def inputs_of(problem: BundleProblem) -> SolveInputs:
     """The numbers of a problem that `differentiable_solve` takes."""
-    data = () if problem.residuals is None else tuple(rows.data for rows in problem.residuals.rows)
+    data = tuple(rows.data for rows in problem.residuals.rows)
     return SolveInputs(problem.observations, problem.cameras, problem.points, data, problem.whitening)
 
 
@@ -138,17 +138,14 @@ def differentiable_solve(
 
 def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
     host = lambda x: np.asarray(x, np.float64)
-    residuals = problem.residuals
-    if residuals is not None:
-        pairs = zip(residuals.rows, inputs.residuals, strict=True)
-        rows = tuple(replace(one, data=tuple(map(host, data))) for one, data in pairs)
-        residuals = replace(residuals, rows=rows)
+    pairs = zip(problem.residuals.rows, inputs.residuals, strict=True)
+    rows = tuple(replace(one, data=tuple(map(host, data))) for one, data in pairs)
     return problem.replace(
         cameras=host(inputs.cameras),
         points=host(inputs.points),
         observations=host(inputs.observations),
         whitening=problem.whitening if inputs.whitening is None else host(inputs.whitening),
-        residuals=residuals,
+        residuals=replace(problem.residuals, rows=rows),
     )
 
 
@@ -252,7 +249,7 @@ def _solve_transposed(
         if theta.whitening is not None:
             here = replace(here, whitening=in_slots(theta.whitening))
         own = zip(layout.residuals, theta.residuals, strict=True)
-        here = replace(here, residuals=tuple(replace(rows, data=data) for rows, data in own))
+        here = replace(here, residuals=tuple(replace(x, rows=replace(x.rows, data=data)) for x, data in own))
         return cost(here, *moved(y, theta), options.loss)
 
     gradient = jax.grad(objective)

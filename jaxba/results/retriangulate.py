@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.lm.step import initial_state
 from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, point_passes
+from jaxba.model.residuals import add_point_terms
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import facing_away
@@ -107,7 +108,7 @@ def retriangulate_without(
         counted, offset, here = placed(problem, away)
         layout = build_layout(here, NO_SYSTEM)
         order, real = layout.points, layout.points < problem.num_points  # without padding points
-        first = np.zeros(problem.num_points, np.int64)
+        first = np.zeros(here.num_points, np.int64)
         first[here.point_index[::-1]] = here.camera_index[::-1]  # the first observation is written last and stays
         origin = np.zeros((3, len(order)))
         centers = geometry.camera_centers(counted.cameras) - offset
@@ -138,12 +139,16 @@ def _search(
         behind = projection.inverse_depth > 0  # a camera looks down -z
         return [slot_costs(loss, view_residuals(views, projection)), behind.astype(start.dtype)]
 
-    own, hidden = one_pass(start, terms)
+    def evaluate(points: Float[Array, "3 points"]) -> tuple[Array, Array]:
+        costs, hidden = one_pass(points, terms)
+        return add_point_terms(layout, state.cameras, points, [costs])[0], hidden
+
+    own, hidden = evaluate(start)
 
     def try_start(best: tuple[Array, Array], position: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
         trial, _ = refine_points(layout, state.cameras, frames, position, loss, POINT_ITERATIONS)
-        trial_costs, lost = one_pass(trial, terms)
+        trial_costs, lost = evaluate(trial)
         better = (trial_costs < costs) & (lost <= hidden)
         return (jnp.where(better, trial, points), jnp.where(better, trial_costs, costs)), None
 

@@ -51,7 +51,6 @@ accepted, or the camera rounds of a step that is not."""
 COMPILE_EVENTS = "/jax/core/compile/"
 """Prefix of the durations that JAX reports while it traces, lowers and compiles."""
 
-
 BREAK_EVEN: dict[Part, int] = {
     "factorization": 1_200_000,
     "iterative": 1_000_000,

@@ -25,11 +25,9 @@ T = TypeVar("T")
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 """Parameter numbers of glibc's mallopt (malloc.h)."""
 
-
 MAPPINGS_SHARE = 0.4
 """Share of the limit of memory mappings from which on programs are dropped. One problem under sixteen solvers took a
 tenth of the limit."""
-
 
 GROWTH_SHARE = 0.1
 """Growth, as a share of the limit, since programs were dropped last, below which they are not dropped again: mappings
@@ -217,3 +215,9 @@ def load_lapack() -> None:
         register_lapack.cache_clear()
     finally:
         del sys.modules[name]
+
+
+def user_cache(part: str) -> Path:
+    """A folder of this package within the user's cache folder, as the XDG base directory specification has it."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(base) / "jaxba" / part

@@ -109,7 +109,7 @@ def choose_linear_solver(
             ProblemError,
             rigs=rigs is not None,
             shared_lenses=bool(shared) and options.intrinsics == "free",
-            residuals=problem.residuals is not None,
+            residuals=bool(problem.residuals),
         )
         return options
     if asked == "auto":
@@ -215,7 +215,7 @@ def _width(problem: BundleProblem) -> int:
     lenses, rigs = problem.lenses, problem.rigs
     extrinsics = 0 if rigs is None or rigs.free is None else EXTRINSICS_SIZE
     own = CAMERA_SIZE if lenses is None else POSE_SIZE + int(np.asarray(lenses.free).any(axis=0).sum())
-    return own + extrinsics + (0 if problem.residuals is None else sum(problem.residuals.sizes))
+    return own + extrinsics + sum(problem.residuals.sizes)
 
 
 def device_memory() -> float:

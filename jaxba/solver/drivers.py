@@ -40,7 +40,6 @@ Callback = Callable[[IterationRecord], bool | None]
 Watch = Callable[[IterationRecord, Callable[[], BundleProblem]], None]
 """Gets the record of an iteration, and a function that gives the problem with the parameters after it."""
 
-
 MIN_LENGTH = 128
 """Smallest length of the record of a compiled loop, so that all lower limits use one program; larger limits are
 rounded up to a power of two."""

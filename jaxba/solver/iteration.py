@@ -94,12 +94,7 @@ def advance(
 
 
 def iterate(
-    layout: Layout,
-    carry: Carry,
-    policy: DampingPolicy,
-    tolerances: Tolerances,
-    options: StepOptions,
-    limit: Any,
+    layout: Layout, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, options: StepOptions, limit: Any
 ) -> tuple[Carry, StepInfo]:
     """The carry after one iteration, and its record. Arguments as for `loop.solve_loop`."""
     state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration)

@@ -28,12 +28,7 @@ failed."""
 
 Dtype = Literal["float64", "float32", "mixed"]
 
-_CHOICES = {
-    "dtype": Dtype,
-    "linear_solver": LinearSolverChoice,
-    "intrinsics": Intrinsics,
-    "compilation": Compilation,
-}
+_CHOICES = {"dtype": Dtype, "linear_solver": LinearSolverChoice, "intrinsics": Intrinsics, "compilation": Compilation}
 """Options that are one of a few words."""
 
 _GROUPS = {

@@ -57,7 +57,7 @@ class Placed(NamedTuple):
         cameras = np.array(self.here.cameras, np.float64)
         cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
         lenses, rigs, residuals = problem.lenses, problem.rigs, self.counted.residuals
-        if residuals is not None:
+        if residuals:
             cameras, own = np.split(cameras, [cameras.shape[1] - sum(residuals.sizes)], axis=1)
             residuals = with_block_values(problem, residuals, own)
         if lenses is not None:  # unobserved cameras follow the others with their lens

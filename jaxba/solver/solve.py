@@ -13,6 +13,7 @@ from jaxtyping import Int
 from jaxba.damping import DampingPolicy
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination
+from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
@@ -80,6 +81,12 @@ class Solution(ArrayRecord):
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
         return self.termination.converged
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """The final cost by kind: of `pixels`, and of each other residual by the name of its function; pixels^2."""
+        others = costs_by_kind(self.problem)
+        return {"pixels": self.final_cost - sum(others.values()), **others}
 
     def plot(self) -> Figure:
         """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""

@@ -223,11 +223,7 @@ def _pairs_of_tracks(
 
 
 def _batch_sums(
-    chunks: Int[np.ndarray, " blocks"],
-    batches: int,
-    batch: int,
-    most: int | None,
-    agreement: Agreement = ALONE,
+    chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None, agreement: Agreement = ALONE
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
     """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
 
@@ -272,10 +268,7 @@ def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 
 
 def _sorted_by_block(
-    rows: Int[np.ndarray, " pairs"],
-    columns: Int[np.ndarray, " pairs"],
-    cameras: int,
-    listed: Int[np.ndarray, " more"],
+    rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int, listed: Int[np.ndarray, " more"]
 ) -> tuple[Int[np.ndarray, " blocks"], Int[np.ndarray, " blocks"], Int[np.ndarray, " pairs"]]:
     """Keys `row * cameras + column` of non-zero blocks, sorted, their numbers of pairs, and pairs sorted by block.
 

@@ -237,7 +237,7 @@ def build_layout(
         clusters=camera_clusters,
         partitions=drawn_partitions,
         unknowns=unknowns,
-        residuals=residual_slots(problem, _inverse(slot, order), slots.points, agreement.within("residuals")),
+        residuals=residual_slots(problem, slot, order, slots.points, agreement.within("residuals")),
         buckets=slots.buckets,
     )
 
@@ -245,16 +245,8 @@ def build_layout(
 def _stands_for_rows(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
     """Which observations have no pixels, but stand for rows of residuals (structure/residual_slots.py)."""
     found = np.zeros(problem.num_observations, bool)
-    for rows in () if problem.residuals is None else problem.residuals.rows:
-        if rows.observation is not None:
-            found[rows.observation[rows.observation >= 0]] = True
-    return found
-
-
-def _inverse(slot: Int[np.ndarray, " sorted"], order: Int[np.ndarray, " sorted"]) -> Int[np.ndarray, " observations"]:
-    """The slot of each observation of the problem."""
-    found = np.zeros(len(order), np.int32)
-    found[order] = slot
+    for rows in problem.residuals.rows:
+        found[rows.observation[rows.observation >= 0]] = True
     return found
 
 

@@ -55,10 +55,7 @@ def clusterings(graph: csr_matrix, largest: int, rng: np.random.Generator) -> It
 
 
 def cluster(
-    graph: csr_matrix,
-    largest: int,
-    previous: Int[np.ndarray, " cameras"] | None,
-    rng: np.random.Generator | None,
+    graph: csr_matrix, largest: int, previous: Int[np.ndarray, " cameras"] | None, rng: np.random.Generator | None
 ) -> Int[np.ndarray, " cameras"]:
     """One clustering: the cluster of every camera, numbered from 0.
 

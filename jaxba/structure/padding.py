@@ -94,7 +94,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
         `MAX_OBSERVATIONS`.
     """
     general = problem.lenses is not None or problem.constants is not None
-    general = general or problem.rigs is not None or problem.residuals is not None
+    general = general or problem.rigs is not None or bool(problem.residuals)
     observations = observations or ObservationOrder.of(problem)
     cameras, points = observations.num_cameras, len(observations.tracks)
     if general or cameras > MAX_CAMERAS:

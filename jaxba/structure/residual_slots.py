@@ -15,17 +15,18 @@ so that eliminating v like any point gives the block of the two cameras. Damping
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.losses import Loss
-from jaxba.problem.residuals import POINT, SECOND, Residual, Residuals
+from jaxba.problem.residuals import SECOND, Residuals, Rows
 from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.structure.agreement import Agreement
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
+
+NOWHERE = 2**30
+"""A slot out of range."""
 
 
 @register_pytree
@@ -33,36 +34,21 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 class ResidualSlots(ArrayRecord):
     """Rows of one residual in a layout."""
 
+    rows: Rows
+    """The function and its data."""
+
     cameras: tuple[Int[AnyArray, " rows"], ...]
     """One or two cameras of each row."""
 
     point: Int[AnyArray, " rows"]
     """Point of each row, in layout order; any if the function takes none."""
 
-    slots: Int[AnyArray, "rows pairs cameras"]
-    """Slots of each row: of each pair of residuals, and each camera; out of range where there is none."""
-
-    data: tuple[Float[AnyArray, "rows ..."], ...]
-    """Data of the function."""
-
-    scale: Float[AnyArray, ""]
-    rotation: Float[AnyArray, "3 3"]
-    translation: Float[AnyArray, "3"]
-    """See `Rows`."""
-
-    residual: Residual = field(metadata={"static": True})
-    loss: Loss = field(metadata={"static": True})
-    size: int = field(metadata={"static": True})
-    """See `Rows`."""
+    slots: Int[AnyArray, "pairs cameras rows"]
+    """Slots of each row: of each pair of numbers, and each camera; out of range where there is none."""
 
     places: tuple[tuple[int, int], ...] = field(metadata={"static": True})
     """For each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
     is no block."""
-
-    @property
-    def has_point(self) -> bool:
-        """Whether the function takes a point."""
-        return POINT in self.residual.unknowns
 
 
 def laid_out(problem: BundleProblem) -> BundleProblem:
@@ -73,7 +59,7 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         ProblemError: see `owners_of`.
     """
     residuals = problem.residuals
-    if residuals is None:
+    if not residuals:
         return problem
     camera, point = [np.asarray(problem.camera_index)], [np.asarray(problem.point_index)]
     observations, points, found, groups = problem.num_observations, problem.num_points, [], block_groups(problem)
@@ -95,9 +81,10 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         observations += size
     more, extra = observations - problem.num_observations, points - problem.num_points
     rest = lambda x, count: np.concatenate([np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)])
-    held = problem.constants
+    held, pairs = problem.constants, zip(residuals.blocks, groups, strict=True)
+    blocks = (np.where((own >= 0)[:, None], np.asarray(x)[np.maximum(own, 0)], 0.0) for x, own in pairs)
     return problem.replace(
-        cameras=np.hstack([np.asarray(problem.cameras), *map(_of_cameras, residuals.blocks, groups)]),
+        cameras=np.hstack([np.asarray(problem.cameras), *blocks]),
         points=rest(problem.points, extra),
         observations=rest(problem.observations, more),
         camera_index=np.concatenate(camera).astype(np.int32),
@@ -106,12 +93,6 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         constants=None if held is None else replace(held, points=rest(held.points, extra)),
         residuals=replace(residuals, rows=tuple(found)),
     )
-
-
-def _of_cameras(
-    block: Float[AnyArray, "n numbers"], group: Int[np.ndarray, " cameras"]
-) -> Float[np.ndarray, "cameras numbers"]:
-    return np.where((group >= 0)[:, None], np.asarray(block)[np.maximum(group, 0)], 0.0)
 
 
 def with_block_values(
@@ -129,7 +110,8 @@ def with_block_values(
 
 def residual_slots(
     problem: BundleProblem,
-    slot: Int[np.ndarray, " observations"],
+    slot: Int[np.ndarray, " sorted"],
+    sorted_observations: Int[np.ndarray, " sorted"],
     points: Int[np.ndarray, " points"],
     agreement: Agreement,
 ) -> tuple[ResidualSlots, ...]:
@@ -137,44 +119,36 @@ def residual_slots(
 
     Args:
         problem: the problem.
-        slot: of each observation.
+        slot: of each of the sorted observations.
+        sorted_observations: their positions in the problem.
         points: the point at each position in layout order.
         agreement: with the other shards of the problem.
     """
     residuals = problem.residuals
-    if residuals is None:
+    if not residuals:
         return ()
+    slot_of = np.zeros(len(slot), np.int32)
+    slot_of[sorted_observations] = slot
     order = np.zeros(problem.num_points + 1, np.int32)
     order[np.minimum(points, problem.num_points)] = np.arange(len(points))
     ends = problem.cameras.shape[1] - sum(residuals.sizes) + np.cumsum([0, *residuals.sizes])
     places = {name: (int(ends[k]), int(ends[k + 1])) for k, name in enumerate(residuals.names)}
     found = []
     for number, rows in enumerate(residuals.rows):
-        if rows.observation is None:
+        if len(rows.observation) != len(rows):
             raise ValueError("a problem with residuals is laid out by jaxba.prepare")
-        observation = np.asarray(rows.observation)
-        own = np.where(observation < 0, len(slot) + len(points) + 2**30, slot[observation]).astype(np.int32)
+        kept = np.arange(agreement.size(f"rows {number}", len(rows)))
+        lost = kept >= len(rows)
+        rows = rows.of(np.where(lost, 0, kept))
+        observation = np.where(lost[:, None, None], -1, rows.observation)
+        own = np.where(observation < 0, NOWHERE, slot_of[observation]).astype(np.int32)
         camera = np.asarray(problem.camera_index)[observation.max(axis=1)]
-        at = rows.of_point()
-        point = np.zeros(len(rows), np.int32) if at is None else order[rows.index[at]]
-        count = agreement.size(f"rows {number}", len(rows))
-
-        def padded(x: Any, fill: Any = 0, count: int = count) -> np.ndarray:
-            return np.concatenate([x, np.full((count - len(x), *np.shape(x)[1:]), fill, np.asarray(x).dtype)])
-
-        data = tuple(np.concatenate([x, np.broadcast_to(x[:1], (count - len(x), *x.shape[1:]))]) for x in rows.data)
         found.append(
             ResidualSlots(
-                cameras=tuple(padded(c) for c in camera.T.astype(np.int32)),
-                point=padded(point),
-                slots=padded(own, 2**30),
-                data=data,
-                scale=rows.scale,
-                rotation=rows.rotation,
-                translation=rows.translation,
-                residual=rows.residual,
-                loss=rows.loss,
-                size=rows.size,
+                rows=rows,
+                cameras=tuple(camera.T),
+                point=order[np.maximum(rows.point, 0)],
+                slots=np.moveaxis(own, 0, 2),
                 places=tuple(places.get(name.removesuffix(SECOND), (0, 0)) for name in rows.residual.unknowns),
             )
         )

@@ -185,7 +185,7 @@ def unknowns_of(
     lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
     padding, index = len(seen) - cameras, np.asarray(lenses.index)
     poses_free = free_poses(problem)
-    own_sizes = () if problem.residuals is None else problem.residuals.sizes
+    own_sizes = problem.residuals.sizes
     own_free = np.ones((cameras, sum(own_sizes)), bool)
     lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:], own_free])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())

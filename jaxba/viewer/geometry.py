@@ -116,10 +116,7 @@ def depth_of_image(half: Float[np.ndarray, "cameras 2"], scale: float) -> Float[
 
 
 def residual_segments(
-    problem: BundleProblem,
-    frusta: Frusta,
-    residuals: Float[np.ndarray, "observations 2"],
-    camera: int,
+    problem: BundleProblem, frusta: Frusta, residuals: Float[np.ndarray, "observations 2"], camera: int
 ) -> tuple[Float[np.ndarray, "own 2 2"], float]:
     """Residuals of an image as segments from each measured pixel towards the predicted one, in its plane.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import support
@@ -25,12 +27,14 @@ from jaxba import (
     with_position_priors,
     with_rotation_priors,
 )
+from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.solver.methods import make_method
 from jaxba.solver.prepare import prepare
 
 EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-13)
+NORMAL = StepOptions(method=GlobalConjugateGradients(replace(EXACT, max_iterations=20000)))
 
 
 def held() -> BundleProblem:
@@ -48,11 +52,11 @@ def constant_numbers(problem: BundleProblem) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "solver", ["explicit", "implicit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sparse", "poba"))]
+    "solver", ["explicit", "implicit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sparse", "deeplm"))]
 )
 def test_a_step_is_that_of_the_dense_problem_without_the_columns_of_constants(solver):
     problem = held()
-    options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT) if solver != "poba" else StepOptions()
+    options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT) if solver != "deeplm" else NORMAL
     layout, before = support.start(problem, options)
     after, _ = support.step(layout, before, 1e-3, options, min_gain=-np.inf)
     found = support.difference(problem, support.back(problem, before, after), options)

@@ -173,7 +173,11 @@ def whole(problem: jaxba.BundleProblem, rows) -> tuple[np.ndarray, object]:
     return np.concatenate([np.ravel(x) for x in parts]), residuals
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=KINDS.values())
+QUICK = ("depth", "drift")
+SLOW = [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow, id=what) for kind, what in KINDS.items()]
+
+
+@pytest.mark.parametrize("kind", SLOW)
 def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
     problem, rows = example(kind)
     start, residuals = whole(problem, rows)
@@ -188,8 +192,14 @@ def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
     assert 0.5 * np.sum(np.square(residuals(after))) == pytest.approx(solution.final_cost, rel=1e-11)
 
 
-@pytest.mark.parametrize("linear_solver", ["explicit", "sparse", "implicit"])
-@pytest.mark.parametrize("policy", ["ceres", "bold"])
+@pytest.mark.parametrize(
+    ("policy", "linear_solver"),
+    [
+        ("bold", "explicit"),
+        pytest.param("ceres", "sparse", marks=pytest.mark.slow),
+        pytest.param("bold", "implicit", marks=pytest.mark.slow),
+    ],
+)
 def test_all_solvers_and_refinements_find_the_same_minimum(policy, linear_solver):
     for kind in ("depth", "relative"):
         problem, _ = example(kind)

@@ -175,7 +175,7 @@ def test_free_directions_of_the_gauge_change_no_residual_and_nothing_that_is_hel
     if problem.constants is not None:
         assert (points[:, np.asarray(problem.constants.points)] == 0).all()
         assert (cameras[:, :, :6][:, np.asarray(problem.constants.poses)] == 0).all()
-    if problem.residuals is not None:
+    if problem.residuals:
         np.testing.assert_allclose(changes(lambda p: geometry.camera_centers(p.cameras)[[1, 3]]), 0.0, atol=1e-8)
 
 

@@ -60,9 +60,32 @@ def compare(problem: BundleProblem, policy: str, rtol: float = 1e-10, **options)
     shared = min(len(one.history.cost), len(several.history.cost))
     assert shared >= 3
     np.testing.assert_allclose(several.history.cost[:shared], one.history.cost[:shared], rtol=rtol)
-    if problem.residuals is None:
+    if not problem.residuals:
         np.testing.assert_allclose(geometry.cost(several.problem), several.final_cost, rtol=max(rtol, 1e-9))
     return several
+
+
+@jaxba.residual
+def depth(pose, point, image, *, measured):
+    return image[0] * pose.to_camera(point)[2] - measured
+
+
+@jaxba.residual
+def apart(pose, pose_2, *, measured):
+    return 10 * (pose.center - pose_2.center - measured)
+
+
+def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
+    problem = support.tiny()
+    camera, point = problem.camera_index[::5], problem.point_index[::5]
+    rows = depth(pose=camera, point=point, image=camera, measured=-geometry.depths(problem)[::5] * 1.01)
+    problem = jaxba.with_residual(problem, rows, unknowns={"image": np.ones((6, 1))}, loss=jaxba.Loss("huber"))
+    centers = geometry.camera_centers(problem.cameras)
+    measured = centers[[0, 1, 2, 3]] - centers[[1, 2, 3, 5]] + 0.01
+    problem = jaxba.with_residual(problem, apart(pose=[0, 1, 2, 3], pose_2=[1, 2, 3, 5], measured=measured))
+    several = compare(problem, "ceres", linear_solver="implicit")
+    blocks = several.problem.residuals.blocks[0]
+    assert (blocks != 1).all()
 
 
 @pytest.mark.parametrize(
@@ -156,8 +179,8 @@ def test_what_several_devices_cannot_do_is_one_line():
     problem = support.single()
     with pytest.raises(ProblemError, match="3 devices are more than there are observed points"):
         solve(problem, "ceres", SolveOptions(devices=DEVICES))
-    with pytest.raises(ProblemError, match="several devices are for plain LM, not for poba"):
-        solve(support.tiny(), "ceres", SolveOptions(devices=DEVICES, method="poba"))
+    with pytest.raises(ProblemError, match="several devices are for plain LM, not for deeplm"):
+        solve(support.tiny(), "ceres", SolveOptions(devices=DEVICES, method="deeplm"))
     with pytest.raises(ProblemError, match="prepare is for one device"):
         jaxba.prepare(support.tiny(), "ceres", SolveOptions(devices=DEVICES))
     with pytest.raises(ValueError, match="devices must be"):

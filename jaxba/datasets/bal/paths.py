@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.runtime.user_cache import user_cache
+from jaxba.runtime.process import user_cache
 
 FOLDER_VARIABLE = "JAXBA_BAL"
 """Environment variable: folder of downloaded problems, instead of `bal` in the user's cache folder."""

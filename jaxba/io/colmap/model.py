@@ -25,7 +25,6 @@ PARTS = ("cameras", "images", "points3D")
 RIG_PARTS = ("rigs", "frames")
 """Files that models have since COLMAP 3.12, both or none."""
 
-
 _LONGEST_NAME = 60  # of an image in messages
 
 
@@ -54,9 +53,7 @@ SENSORS = {"CAMERA": CAMERA_SENSOR, "IMU": 1}
 KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 """A key-point: pixels, and the id of its point or `NO_POINT`."""
 
-POINT = np.dtype(
-    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")],
-)
+POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 """A point, with the number of elements of its track. As in a binary file, where the track follows."""
 
 TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])

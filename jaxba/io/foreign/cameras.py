@@ -27,7 +27,6 @@ from jaxba.problem.intrinsics import Lenses
 BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 """Coefficients of the two kinds of distortion, in the order in which OpenMVG and AliceVision write them."""
 
-
 UNDEFINED = 2**32 - 1
 """Number that stands for no pose or no intrinsic. Source: `UndefinedIndexT` in types.hpp of both programs."""
 

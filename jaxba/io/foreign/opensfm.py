@@ -33,7 +33,6 @@ _RADIAL = {"simple_radial": 1, "radial": 2, "brown": 3, "fisheye_opencv": 4}
 MODELS = ("perspective", "fisheye", *_RADIAL)
 """Camera models that are read."""
 
-
 PARTS = ("cameras", "shots", "points", "rig_cameras", "rig_instances", "biases", "reference_lla", "reference")
 """Parts of a reconstruction that are read, or that say nothing without measured positions."""
 

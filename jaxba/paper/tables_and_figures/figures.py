@@ -43,11 +43,7 @@ def _small(runner: Runner) -> list[Part]:
     for size in config.small:
         seeds = range(config.seed, config.seed + config.small_scenes)
         paper = lambda iterations, size=size: iterations if size == PAPER_SIZE else float("nan")
-        lines = [
-            named("classic", CLASSIC, paper(5.0)),
-            named("Ceres' rule", CERES),
-            *ours(runner, paper(4.0)),
-        ]
+        lines = [named("classic", CLASSIC, paper(5.0)), named("Ceres' rule", CERES), *ours(runner, paper(4.0))]
         text = "{}: ours takes four fifths of classic's iterations"
         longer = "{}: ours takes longer in seconds, for the time of inference"
         stated = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxba.model import residuals as model
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -17,6 +19,7 @@ from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
 from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residuals, Rows, with_rows
+from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 from jaxba.structure.agreement import ALONE
 from jaxba.structure.residual_slots import ResidualSlots, laid_out, residual_slots
@@ -60,69 +63,86 @@ def with_residual(
     counts = {POSE: problem.num_cameras, LENS: lenses, POINT: problem.num_points}
     rows = replace(rows, loss=loss or Loss(), size=1)
     found = with_rows(problem.residuals, rows, dict(unknowns or {}), counts)
-    rows = replace(rows, size=_checked(problem, found))
+    rows = replace(found.rows[-1], size=_checked(problem, found))
     return problem.replace(residuals=replace(found, rows=(*found.rows[:-1], rows)))
 
 
-@numerics(np.float64)
+def costs_by_kind(problem: BundleProblem) -> dict[str, float]:
+    """The cost of each residual besides those of pixels, by the name of its function."""
+    found: dict[str, float] = {}
+    with numerics(np.float64):
+        kinds, of, at = _rows_of(problem)
+        for kind in kinds:
+            costs = model.row_costs(kind.rows, jit(model.values)(kind, of, *at))
+            name = kind.rows.residual.name
+            found[name] = found.get(name, 0.0) + float(jnp.sum(costs))
+    return found
+
+
+def _rows_of(problem: BundleProblem) -> tuple[tuple[ResidualSlots, ...], Unknowns, tuple[jax.Array, jax.Array]]:
+    """Rows of all residuals, and cameras and points as their functions need them."""
+    here = laid_out(in_frames(problem))
+    every, seen = np.arange(here.num_points), np.bincount(here.camera_index, minlength=here.num_cameras) > 0
+    of = unknowns_of(here, seen, every, fixed=False, agreement=ALONE)
+    rows = np.arange(here.num_observations)
+    kinds = residual_slots(here, rows, rows, every, ALONE)
+    return kinds, of, (jnp.asarray(here.cameras.T), jnp.asarray(here.points.T))
+
+
 def _checked(problem: BundleProblem, residuals: Residuals) -> int:
     """Numbers in a row of the last residual, if there is nothing wrong with it."""
-    rows = residuals.rows[-1]
-    name = rows.residual.name
+    name = residuals.rows[-1].residual.name
     with numerics(np.float64):
-        here = laid_out(in_frames(problem.replace(residuals=residuals)))
-        every = np.arange(here.num_points)
-        seen = np.bincount(here.camera_index, minlength=here.num_cameras) > 0
-        of = unknowns_of(here, seen, every, fixed=False, agreement=ALONE)
-        kind = residual_slots(here, np.arange(here.num_observations), every, ALONE)[-1]
-        at = jnp.asarray(here.cameras.T), jnp.asarray(here.points.T)
+        (*_, kind), of, at = _rows_of(problem.replace(residuals=residuals))
         try:
-            shape = jax.eval_shape(lambda: model.values(kind, of, *at)).shape
+            shape = jax.eval_shape(functools.partial(model.values, kind, of), *at).shape[::-1]
         except Exception as error:
             text = " ".join(str(error).split())
             raise ValueError(f"residual {name} cannot be computed: {shown(text, 200)}") from error
         if len(shape) != 2 or not shape[1]:
-            raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[1:]}")
-        kind = replace(kind, size=shape[1])
-        found = np.asarray(model.values(kind, of, *at))
-        bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
+            raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[:0:-1]}")
+        residual, *derivatives = jax.device_get(jit(model.differentiated)(kind, of, *at))
+        bad = np.flatnonzero(~np.isfinite(residual).all(axis=0))
         if bad.size:
-            raise ValueError(f"residual {name} is not finite at the start in row {bad[0]}: {shown(found[bad[0]])}")
-        linear = jax.device_get(model.linearized(kind, of, *at))
-        _check_dependence(kind, of, linear)
+            where = f"row {bad[0]}: {shown(residual[:, bad[0]])}"
+            raise ValueError(f"residual {name} is not finite at the start in {where}")
+        _check_dependence(kind, of, *derivatives)
         _check_differences(kind, of, *at)
     return shape[1]
 
 
-def _check_dependence(kind: ResidualSlots, unknowns: Unknowns, linear: model.Linear) -> None:
+def _check_dependence(
+    kind: ResidualSlots,
+    unknowns: Unknowns,
+    by_camera: Float[np.ndarray, "size cameras width rows"],
+    by_point: Float[np.ndarray, "size 3 rows"],
+) -> None:
     """Raises a ValueError for a parameter that the residual depends on in no row, or whose derivative is not finite."""
-    by_camera = np.array(linear.by_camera).reshape(2, unknowns.width, -1, len(kind.cameras))
     numbers = np.array([*range(POSE_SIZE), *(POSE_SIZE + column for column in unknowns.columns)])
-    for name, (start, end) in zip(kind.residual.unknowns, kind.places, strict=True):
+    what = f"residual {kind.rows.residual.name}"
+    for name, (start, end) in zip(kind.rows.residual.unknowns, kind.places, strict=True):
         base, which = name.removesuffix(SECOND), int(name.endswith(SECOND) and len(kind.cameras) > 1)
-        if base == POINT:
-            own = np.array(linear.by_point)
-        else:
-            lens = POSE_SIZE + unknowns.lens_size
-            first, last = {POSE: (0, POSE_SIZE), LENS: (POSE_SIZE, lens)}.get(base, (start, end))
-            own = by_camera[:, (numbers >= first) & (numbers < last), :, which]
+        lens = POSE_SIZE, POSE_SIZE + unknowns.lens_size
+        first, last = {POSE: (0, POSE_SIZE), LENS: lens}.get(base, (start, end))
+        own = by_point if base == POINT else by_camera[:, which, (numbers >= first) & (numbers < last)]
         if not np.isfinite(own).all():
-            raise ValueError(f"the derivative of residual {kind.residual.name} by {name} is not finite at the start")
+            raise ValueError(
+                f"the derivative of residual {kind.rows.residual.name} by {name} is not finite at the start"
+            )
         if own.size and not own.any():
-            raise ValueError(f"residual {kind.residual.name} does not depend on {name} at the start, in no row")
+            raise ValueError(f"{what} depends on {name} in no row at the start")
 
 
 def _check_differences(kind: ResidualSlots, unknowns: Unknowns, cameras: jax.Array, points: jax.Array) -> None:
     """Raises a ProblemError where derivatives do not agree with central differences in most rows."""
     few = np.linspace(0, len(kind.point) - 1, min(len(kind.point), CHECKED)).astype(int)
-    take = lambda x: np.asarray(x)[few]
-    parts = {"cameras": tuple(map(take, kind.cameras)), "data": tuple(map(take, kind.data))}
-    kind = replace(kind, point=take(kind.point), slots=take(kind.slots), **parts)
+    cameras_of = tuple(np.asarray(x)[few] for x in kind.cameras)
+    kind = replace(kind, rows=kind.rows.of(few), cameras=cameras_of, point=np.asarray(kind.point)[few])
     random = np.random.default_rng(0)
     change = [random.standard_normal(x.shape) * np.maximum(1.0, np.abs(x)) for x in (cameras, points)]
-    at = lambda step: model.values(kind, unknowns, cameras + step * change[0], points + step * change[1])
+    at = jit(lambda step: model.values(kind, unknowns, cameras + step * change[0], points + step * change[1]))
     _, rate = jax.jvp(at, (0.0,), (1.0,))
-    size = np.abs(rate).max(axis=1) + 1e-6 * np.abs(at(0.0)).max(axis=1)
-    wrong = np.abs((at(STEP) - at(-STEP)) / (2 * STEP) - rate).max(axis=1) > AGREE * size
+    size = np.abs(rate).max(axis=0) + 1e-6 * np.abs(at(0.0)).max(axis=0)
+    wrong = np.abs((at(STEP) - at(-STEP)) / (2 * STEP) - rate).max(axis=0) > AGREE * size
     if np.mean(wrong) > 0.5:
-        raise ProblemError(f"derivatives of residual {kind.residual.name} do not agree with differences")
+        raise ProblemError(f"derivatives of residual {kind.rows.residual.name} do not agree with differences")
