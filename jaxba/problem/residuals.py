@@ -9,7 +9,9 @@ Keyword-only parameters are data, a row each. The function whitens its residual 
 
 from __future__ import annotations
 
+import importlib
 import inspect
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -50,6 +52,10 @@ class Residual:
     def __repr__(self) -> str:
         return f"Residual({self.name})"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By name, so that a problem may be pickled: where the decorated function can be imported."""
+        return _imported, (self.function.__module__, self.function.__qualname__)
+
     def __call__(self, **columns: Any) -> Rows:
         """Rows of the residual.
 
@@ -78,6 +84,10 @@ class Residual:
             own = value.shape[1:] if value.shape[:1] in ((1,), (count,)) else value.shape
             data.append(np.broadcast_to(value, (count, *own)))
         return Rows(tuple(index), tuple(data), residual=self)
+
+
+def _imported(module: str, name: str) -> Residual:
+    return operator.attrgetter(name)(importlib.import_module(module))
 
 
 def residual(function: Callable[..., Any]) -> Residual:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -120,6 +122,14 @@ def test_a_moved_scene_has_the_same_residuals_and_the_same_end():
     here = jaxba.solve(jaxba.normalize(problem), "ceres", options)
     assert here.initial_cost == pytest.approx(there.initial_cost, rel=1e-9)
     assert here.final_cost == pytest.approx(there.final_cost, rel=1e-6)
+
+
+def test_a_problem_with_residuals_can_be_pickled_and_compared():
+    problem = jaxba.with_position_priors(
+        everything(), geometry.camera_centers(scene().cameras), stddev=1.0, align=False
+    )
+    assert pickle.loads(pickle.dumps(problem)) == problem
+    assert "2 rows of position, 2 rows of relative_pose, 5 rows of position_prior" in repr(problem)
 
 
 def test_points_are_looked_for_anew_with_all_residuals():
