@@ -29,8 +29,7 @@ CHECKED = 64
 """Most rows whose derivatives are compared with differences."""
 
 STEP, AGREE = 1e-6, 1e-3
-"""Step of central differences, relative to a number or one, and how near they have to be to derivatives, relative to
-the largest; functions with kinks differ in a few rows."""
+"""Relative step of central differences, and how near they have to be to derivatives, relative to the largest."""
 
 
 def with_residual(
@@ -48,17 +47,16 @@ def with_residual(
             several cameras have in common. `Solution.problem.residuals` has their values after a solve.
 
     Raises:
-        ValueError: an index is out of range, a block is missing or malformed, or the function cannot be computed, is
-            not finite at the start, or depends on a parameter in no row; one line.
-        ProblemError: unknowns of one row belong to different cameras without saying so (`_2`), or derivatives do not
-            agree with differences.
+        ValueError, ProblemError: an index is out of range, a block is missing or malformed, unknowns of a row belong to
+            different cameras without saying so (`_2`), or the function cannot be computed, is not finite at the start,
+            depends on a parameter in no row, or has other derivatives than differences; one line.
     """
     if not isinstance(rows, Rows):
         raise ValueError(f"rows must be those of a residual, called with indices and data, not {shown(rows)}")
+    if not isinstance(loss, Loss | None) or not isinstance(unknowns, Mapping | None):
+        raise ValueError(f"loss must be a jaxba.Loss and unknowns a dict, not {shown(loss)} and {shown(unknowns)}")
     if not len(rows):
         return problem
-    if not isinstance(loss, Loss | None):
-        raise ValueError(f"loss must be a jaxba.Loss, not {shown(loss)}")
     lenses = problem.num_cameras if problem.lenses is None else len(problem.lenses.free)
     counts = {POSE: problem.num_cameras, LENS: lenses, POINT: problem.num_points}
     rows = replace(rows, loss=loss or Loss(), size=1)

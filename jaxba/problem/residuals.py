@@ -23,8 +23,8 @@ from jaxba.problem.checks import indices, plain_array, real_numbers, shown
 from jaxba.problem.losses import Loss
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-POSE, LENS, POINT = "pose", "lens", "point"
-"""Names of unknowns that every problem has."""
+POSE, LENS, POINT, PIXELS = "pose", "lens", "point", "pixels"
+"""Names of unknowns that every problem has, and of the costs of its observations."""
 
 SECOND = "_2"
 """Ending of the names of a second camera's unknowns."""
@@ -53,7 +53,7 @@ class Residual:
         return f"Residual({self.name})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """By name, so that a problem may be pickled: where the decorated function can be imported."""
+        """By name: a problem may be pickled where the decorated function can be imported."""
         return _imported, (self.function.__module__, self.function.__qualname__)
 
     def __call__(self, **columns: Any) -> Rows:
@@ -62,7 +62,8 @@ class Residual:
         Args:
             columns: for each unknown an index or a vector of them: a camera for `pose`, a point for `point`, a lens (a
                 camera in a problem without shared lenses) for `lens`, a row for a block. For each keyword of data an
-                array with a row for each residual, or one value for all.
+                array with a row for each residual, or one value for all, with a first axis of one if its own first axis
+                is as long as there are residuals.
 
         Raises:
             ValueError: a name is missing or unknown, lengths differ, or something is no index or no number; one line.
@@ -75,7 +76,7 @@ class Residual:
         count = max(map(len, given))
         index, data = [np.broadcast_to(one, count) if one.shape == (1,) else one for one in given], []
         for x, one in zip(self.unknowns, index, strict=True):
-            if one.shape != (count,) or one.dtype.kind not in "iu":
+            if one.shape != (count,) or (count and one.dtype.kind not in "iu"):
                 raise ValueError(f"{x} of {self.name} must be a vector of {count} integers, not {shown(columns[x])}")
         for x in self.data:
             value = real_numbers(f"{x} of {self.name}", columns[x])
@@ -100,6 +101,8 @@ def residual(function: Callable[..., Any]) -> Residual:
     Raises:
         ValueError: it has no unknown, or parameters of another kind; one line.
     """
+    if not inspect.isfunction(function) or function.__name__ == PIXELS:
+        raise ValueError(f"a residual is made of a function that is not named {PIXELS}, not of {shown(function)}")
     kinds = inspect.Parameter
     found = inspect.signature(function).parameters.values()
     wrong = [p.name for p in found if p.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD) or p.default is not p.empty]
@@ -109,6 +112,8 @@ def residual(function: Callable[..., Any]) -> Residual:
     unknowns = tuple(p.name for p in found if p.name not in data)
     if not unknowns:
         raise ValueError(f"residual {function.__name__} has no unknown: its positional parameters are unknowns")
+    if POINT + SECOND in unknowns:
+        raise ValueError(f"residual {function.__name__}: two points in one row are not supported")
     return Residual(function, unknowns, data)
 
 
@@ -190,17 +195,19 @@ class Residuals(ArrayRecord):
         return replace(self, rows=tuple(found))
 
     def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals:
-        """Those of some of the observations and points of a problem that is laid out; of others none."""
+        """Those of some of the points, and in a problem that is laid out of some of the observations."""
         place, found = np.where(observations, np.cumsum(observations) - 1, -1), []
         for rows in self.rows:
             if len(rows.observation):
                 own = place[np.asarray(rows.observation)]
                 kept = np.flatnonzero((own >= 0).any(axis=(1, 2)))
                 rows = replace(rows, observation=own).of(kept if len(kept) else np.zeros(1, int))  # never empty
-                pairs = zip(rows.residual.unknowns, rows.index, strict=True)
-                index = (np.searchsorted(points, i).astype(np.int32) if name == POINT else i for name, i in pairs)
-                found.append(replace(rows, index=tuple(index)))
-        return replace(self, rows=tuple(found)) if found else Residuals()
+            else:
+                rows = rows.of((rows.point < 0) | np.isin(rows.point, points))
+            pairs = zip(rows.residual.unknowns, rows.index, strict=True)
+            index = (np.searchsorted(points, i).astype(np.int32) if name == POINT else i for name, i in pairs)
+            found += [replace(rows, index=tuple(index))] if len(rows) else []
+        return replace(self, rows=tuple(found))
 
 
 def with_rows(residuals: Residuals, rows: Rows, unknowns: dict[str, Any], counts: dict[str, int]) -> Residuals:
@@ -213,8 +220,11 @@ def with_rows(residuals: Residuals, rows: Rows, unknowns: dict[str, Any], counts
         if own in counts or own in blocks or own.endswith(SECOND):
             raise ValueError(f"a new unknown may not be named {own}")
         blocks[own] = real_numbers(f"unknown {own}", value)
-        if blocks[own].ndim != 2 or not blocks[own].size or not np.isfinite(blocks[own]).all():
-            raise ValueError(f"unknown {own} must have finite numbers of shape (n, numbers), not {shown(value)}")
+        whole = blocks[own].ndim == 2 and 0 < len(blocks[own]) <= counts[POSE] and blocks[own].size > 0
+        if not whole or not np.isfinite(blocks[own]).all():
+            raise ValueError(f"unknown {own} must have finite numbers, 1 to {counts[POSE]} rows, not {shown(value)}")
+        if own not in {name.removesuffix(SECOND) for name in rows.residual.unknowns}:
+            raise ValueError(f"unknown {own} is no parameter of residual {name}")
     counts = counts | {own: len(block) for own, block in blocks.items()}
     index = []
     for own, given in zip(rows.residual.unknowns, rows.index, strict=True):

@@ -41,11 +41,12 @@ def _named_camera(problem: BundleProblem, rows: Rows, ending: str) -> Int[np.nda
     """The camera of each row that a pose, a lens or a block with a row for each camera names; -1 for none."""
     residuals, count = problem.residuals, problem.num_cameras
     lens = np.arange(count) if problem.lenses is None else np.asarray(problem.lenses.index)
-    first = np.full(lens.max(initial=0) + 1, -1)
+    first = np.full(count if problem.lenses is None else len(problem.lenses.free), -1)
     first[lens[::-1]] = np.arange(count)[::-1]
     shared = {name for name, block in zip(residuals.names, residuals.blocks, strict=True) if len(block) < count}
     found = np.full(len(rows), -1)
-    for name, index in zip(rows.residual.unknowns, rows.index, strict=True):
+    pairs = zip(rows.residual.unknowns, rows.index, strict=True)
+    for name, index in sorted(pairs, key=lambda pair: pair[0].startswith(LENS)):  # others say which camera it is
         base = name.removesuffix(SECOND)
         if name != base + ending or base == POINT or base in shared:
             continue

@@ -38,10 +38,6 @@ class Pose(NamedTuple):
         """A point of the world in the camera's frame; its last number is the depth."""
         return _times(self.rotation, point) + self.translation
 
-    def to_world(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """A point of the camera's frame in the world."""
-        return _times(self.rotation.T, point - self.translation)
-
     def between(self, other: Pose) -> Pose:
         """From the frame of this camera to that of another: `P_2 = R P_1 + t`."""
         rotation = other.rotation @ self.rotation.T
@@ -53,7 +49,7 @@ class Pose(NamedTuple):
 
 
 def _times(matrix: Array, vector: Array) -> Array:
-    """The product with a vector, term by term: so that XLA fuses it, of many rows, with what surrounds it."""
+    """The product with a vector, term by term, which XLA fuses with what surrounds it."""
     return sum(matrix[:, k] * vector[k] for k in range(3))  # pyright: ignore[reportReturnType]
 
 

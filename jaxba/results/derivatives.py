@@ -169,7 +169,8 @@ def _transposed(
         raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
     kept = np.flatnonzero(~np.isin(solved.camera_index, away))  # observations that count
     with numerics(np.float64):
-        slots = jnp.asarray(np.append(kept, 0)[setup.layout.observation])
+        rest = np.zeros(len(here.camera_index) - len(kept) + 1, int)  # those that stand for other residuals, and none
+        slots = jnp.asarray(np.append(kept, rest)[setup.layout.observation])
         arguments = (setup.layout, slots, here, *_symmetries(counted, setup.layout), inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < LARGEST_RESIDUAL:
@@ -184,6 +185,7 @@ def _symmetries(
     free, in all numbers of cameras and points; and the directions in which rays determine points, in layout order."""
     order, determined = np.asarray(layout.points), determined_directions(solved)
     cameras, points = free_directions(solved)
+    cameras = np.pad(cameras, ((0, 0), (0, 0), (0, sum(layout.unknowns.own_sizes))))
     cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
     # only what of it is not already a motion of points along their rays
     points = np.einsum("pij,kpj->kpi", determined, points)
@@ -209,7 +211,7 @@ def _solve_transposed(
 ) -> tuple[SolveInputs, Array]:
     state = initial_state(layout, solved, options, jnp.float64)
     unknowns, order = layout.unknowns, layout.points
-    count = state.cameras.shape[1]
+    count, end = state.cameras.shape[1], len(state.cameras) - sum(unknowns.own_sizes)
     seen = jnp.asarray(layout.camera_seen)[:, None]
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -229,18 +231,20 @@ def _solve_transposed(
     def of_frames(cameras: AnyArray) -> Array:
         """Cameras as the inputs have them, as those of the state."""
         if not unknowns.in_rigs:
-            return jnp.asarray(cameras)
-        place = state.cameras[-EXTRINSICS_SIZE:]
+            return jnp.concatenate([cameras, state.cameras[end:].T], axis=1)
+        place = state.cameras[end - EXTRINSICS_SIZE : end]
         turn, rows = rotation_matrix(place[:3]), jnp.asarray(cameras).T
         moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
-        return jnp.concatenate([compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place]).T
+        return jnp.concatenate(
+            [compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place, state.cameras[end:]]
+        ).T
 
     def found(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters as the solution has them."""
         cameras, points = moved(y, theta)
         if not unknowns.in_rigs:
-            return cameras, points
-        own = cameras[POSE_SIZE:-EXTRINSICS_SIZE]
+            return cameras[:end], points
+        own = cameras[POSE_SIZE : end - EXTRINSICS_SIZE]
         return jnp.concatenate([*camera.poses(cameras, unknowns), own]), points
 
     def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:

@@ -15,6 +15,7 @@ from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination
 from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.residuals import PIXELS
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.numerics import numerics
@@ -86,7 +87,7 @@ class Solution(ArrayRecord):
     def costs(self) -> dict[str, float]:
         """The final cost by kind: of `pixels`, and of each other residual by the name of its function; pixels^2."""
         others = costs_by_kind(self.problem)
-        return {"pixels": self.final_cost - sum(others.values()), **others}
+        return {PIXELS: self.final_cost - sum(others.values()), **others}
 
     def plot(self) -> Figure:
         """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""

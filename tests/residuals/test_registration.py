@@ -72,8 +72,16 @@ def refused():
         "no start": (of(depths(pose=0, point=0, image=0)), "image of residual depth has no start: give unknowns"),
         "start of another shape": (
             of(depths(pose=0, point=0, image=0), unknowns={"image": 1.0}),
-            "unknown image must have finite numbers of shape",
+            "unknown image must have finite numbers, 1 to 5 rows",
         ),
+        "too many rows": (
+            of(depths(pose=0, point=0, image=0), unknowns={"image": np.ones((CAMERAS + 1, 2))}),
+            "unknown image must have finite numbers, 1 to 5 rows",
+        ),
+        "no parameter of it": (of(position(pose=0, **ones), unknowns={"foo": [[1.0]]}), "unknown foo is no parameter"),
+        "no dict": (of(position(pose=0, **ones), unknowns=[1]), "unknowns a dict"),
+        "two points": (lambda _: jaxba.residual(lambda point, point_2: point - point_2), "two points in one row"),
+        "no function": (lambda _: jaxba.residual(3), "made of a function"),
         "a taken name": (of(position(pose=0, **ones), unknowns={"lens": [[1.0]]}), "may not be named lens"),
         "two cameras": (
             of(depths(pose=0, point=0, image=1), unknowns=image),
@@ -122,6 +130,32 @@ def test_a_moved_scene_has_the_same_residuals_and_the_same_end():
     here = jaxba.solve(jaxba.normalize(problem), "ceres", options)
     assert here.initial_cost == pytest.approx(there.initial_cost, rel=1e-9)
     assert here.final_cost == pytest.approx(there.final_cost, rel=1e-6)
+
+
+def test_invalid_observations_are_dropped_and_residuals_stay():
+    problem = everything()
+    points = problem.points.copy()
+    seen = problem.camera_index[problem.point_index == 4]
+    centers = geometry.camera_centers(problem.cameras)[seen]
+    points[4] = centers.mean(axis=0) + 3 * (centers.mean(axis=0) - points[4])  # behind all of its cameras
+    kept = jaxba.drop_invalid(problem.replace(points=points))
+    assert kept.num_points == POINTS - 1
+    of = dict(zip(["depth", "position", "relative_pose"], kept.residuals.rows, strict=True))
+    assert len(of["depth"]) == np.sum(problem.residuals.rows[0].point != 4)
+    before = problem.residuals.rows[0].point
+    np.testing.assert_array_equal(kept.points[of["depth"].point], points[before[before != 4]])
+
+
+def test_derivatives_by_the_data_are_those_of_differences():
+    problem = jaxba.hold(everything(), poses=[0])
+    tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15), max_iterations=200)
+    solve = jaxba.differentiable_solve(problem, "ceres", tight)
+    inputs = jax.tree.map(jnp.asarray, jaxba.inputs_of(problem))
+    value = lambda inputs: jnp.sum(solve(inputs)[1][::7])
+    found = jax.grad(value)(inputs)
+    (measured, sigma), *rest = inputs.residuals
+    at = lambda step: value(inputs._replace(residuals=((measured.at[5].add(step), sigma), *rest)))
+    np.testing.assert_allclose(found.residuals[0][0][5], (at(1e-4) - at(-1e-4)) / 2e-4, rtol=5e-3)
 
 
 def test_a_problem_with_residuals_can_be_pickled_and_compared():
