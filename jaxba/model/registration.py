@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from jaxba.model import residuals as model
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -109,12 +108,7 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> int:
     return shape[1]
 
 
-def _check_dependence(
-    kind: ResidualSlots,
-    unknowns: Unknowns,
-    by_camera: Float[np.ndarray, "size cameras width rows"],
-    by_point: Float[np.ndarray, "size 3 rows"],
-) -> None:
+def _check_dependence(kind: ResidualSlots, unknowns: Unknowns, by_camera: np.ndarray, by_point: np.ndarray) -> None:
     """Raises a ValueError for a parameter that the residual depends on in no row, or whose derivative is not finite."""
     numbers = np.array([*range(POSE_SIZE), *(POSE_SIZE + column for column in unknowns.columns)])
     what = f"residual {kind.rows.residual.name}"
@@ -124,9 +118,7 @@ def _check_dependence(
         first, last = {POSE: (0, POSE_SIZE), LENS: lens}.get(base, (start, end))
         own = by_point if base == POINT else by_camera[:, which, (numbers >= first) & (numbers < last)]
         if not np.isfinite(own).all():
-            raise ValueError(
-                f"the derivative of residual {kind.rows.residual.name} by {name} is not finite at the start"
-            )
+            raise ValueError(f"the derivative of {what} by {name} is not finite at the start")
         if own.size and not own.any():
             raise ValueError(f"{what} depends on {name} in no row at the start")
 

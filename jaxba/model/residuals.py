@@ -15,12 +15,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
 from jaxba.model import camera
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.residuals import POINT, Rows
+from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.problem.row_value import Cameras, value
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.fusion import compute_unfused, fusion_barrier
@@ -136,16 +138,16 @@ def differentiated(
     given = _gathered(rows, unknowns, cameras, points)
     try:
         residual, derivatives = _each(backward)(*given)
-    except Exception:  # a loop whose length is not known, or a rule for forward mode alone
+    except (ValueError, TypeError, NotImplementedError):  # a loop of unknown length, or a rule for forward mode alone
         residual, derivatives = _each(forward)(*given)
     by_rotation, by_translation, by_numbers, by_point = derivatives
     # R <- R + [w]x R changes the residual by w . sum of R_j x dr/dR_j over columns j
     turn = jnp.sum(jnp.cross(given[0][None], by_rotation, axis=2), axis=3)
     if unknowns.in_rigs:  # R = M R_f and t = M t_f + m, with steps of frames and of M and m
-        place, end = given[4][None], unknowns.lens_size
-        matrix = place[:, :, :9].reshape(1, len(rows.cameras), 3, 3, -1)
+        place, ends = given[4][None], unknowns.lens_size + np.array([0, EXTRINSICS_SIZE])
+        matrix, (lens, _, own) = place[:, :, :9].reshape(1, len(rows.cameras), 3, 3, -1), jnp.split(by_numbers, ends, 2)
         of_place = turn + jnp.cross(place[:, :, 9:], by_translation, axis=2), by_translation
-        by_numbers = jnp.concatenate([by_numbers[:, :, :end], *of_place, by_numbers[:, :, end + 6 :]], axis=2)
+        by_numbers = jnp.concatenate([lens, *of_place, own], axis=2)
         turn, by_translation = (jnp.sum(matrix * x[:, :, :, None], axis=2) for x in (turn, by_translation))
     whole = jnp.concatenate([turn, by_translation, by_numbers], axis=2)
     return residual, jnp.asarray(unknowns.restricted(whole)), by_point

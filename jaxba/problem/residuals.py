@@ -171,8 +171,11 @@ class Residuals(ArrayRecord):
     rows: tuple[Rows, ...] = ()
     """Rows of each residual."""
 
-    blocks: tuple[Float[AnyArray, "n numbers"], ...] = ()
+    blocks: tuple[Float[AnyArray, "_ _"], ...] = ()
     """Values of the unknowns that only residuals have, a row for each camera, or fewer."""
+
+    groups: tuple[Int[AnyArray, " cameras"], ...] = ()
+    """The row of each block that each camera has, by all rows of a problem that is laid out (`block_groups`)."""
 
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     """Names of the blocks."""

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.camera_models import BAL
 from jaxba.problem.geometry import camera_centers, rotation_matrices
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.residuals import SECOND, Rows
-from jaxba.problem.row_owners import block_groups, owners_of
+from jaxba.problem.row_owners import Owners, block_groups, owners_of
 from jaxba.problem.row_value import Cameras, value
 from jaxba.rotations import rotation_matrix
 from jaxba.runtime.numerics import numerics
@@ -30,19 +30,14 @@ def changes_by_similarity(
     its point in the same units."""
     groups = block_groups(problem)
     with numerics(np.float64):
-        pairs = [(rows, owners_of(problem, rows, groups)) for rows in problem.residuals.rows]
-        return [_changes(problem, rows, owner.cameras, owner.point, middle, extent) for rows, owner in pairs]
+        every = problem.residuals.rows
+        return [_changes(problem, rows, owners_of(problem, rows, groups), middle, extent) for rows in every]
 
 
 def _changes(
-    problem: BundleProblem,
-    rows: Rows,
-    cameras: list[Int[np.ndarray, " rows"]],
-    point: Int[np.ndarray, " rows"],
-    middle: Float[np.ndarray, "3"],
-    extent: float,
+    problem: BundleProblem, rows: Rows, owners: Owners, middle: Float[np.ndarray, "3"], extent: float
 ) -> Float[np.ndarray, "numbers 7"]:
-    own, lenses = np.maximum(np.stack(cameras, axis=1), 0), problem.lenses
+    own, lenses = np.maximum(np.stack(owners.cameras, axis=1), 0), problem.lenses
     at, shape = np.asarray(problem.cameras, np.float64)[own.ravel()], own.shape
     models = (BAL,) if lenses is None else lenses.models
     model = np.zeros(shape, int) if lenses is None or lenses.model is None else lenses.model[lenses.index[own]]
@@ -68,7 +63,7 @@ def _changes(
         camera_centers(at).reshape(*shape, 3),
         at[:, POSE_SIZE:].reshape(*shape, -1),
         model,
-        np.asarray(problem.points, np.float64)[np.maximum(point, 0)],
+        np.asarray(problem.points, np.float64)[np.maximum(owners.point, 0)],
         *blocks,
         *rows.data,
     )

@@ -22,6 +22,8 @@ def block_groups(problem: BundleProblem) -> list[Int[np.ndarray, " cameras"]]:
     """For each block of residuals the row that each camera has, negative and different where it has none. Raises
     ProblemError: see `owners_of`."""
     residuals, count, found = problem.residuals, problem.num_cameras, []
+    if residuals.groups:
+        return [np.asarray(group) for group in residuals.groups]
     for name, block in zip(residuals.names, residuals.blocks, strict=True):
         group = np.arange(count) if len(block) == count else -1 - np.arange(count)
         for rows in residuals.rows if len(block) < count else ():

@@ -91,7 +91,7 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         point_index=np.concatenate(point).astype(np.int32),
         whitening=None if problem.whitening is None else rest(problem.whitening, more),
         constants=None if held is None else replace(held, points=rest(held.points, extra)),
-        residuals=replace(residuals, rows=tuple(found)),
+        residuals=replace(residuals, rows=tuple(found), groups=tuple(groups)),
     )
 
 

@@ -71,8 +71,8 @@ def depth(pose, point, image, *, measured):
 
 
 @jaxba.residual
-def apart(pose, pose_2, *, measured):
-    return 10 * (pose.center - pose_2.center - measured)
+def apart(pose, pose_2, size, *, measured):
+    return 10 * (pose.center - pose_2.center - size[0] * measured)
 
 
 def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
@@ -82,10 +82,12 @@ def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
     problem = jaxba.with_residual(problem, rows, unknowns={"image": np.ones((6, 1))}, loss=jaxba.Loss("huber"))
     centers = geometry.camera_centers(problem.cameras)
     measured = centers[[0, 1, 2, 3]] - centers[[1, 2, 3, 5]] + 0.01
-    problem = jaxba.with_residual(problem, apart(pose=[0, 1, 2, 3], pose_2=[1, 2, 3, 5], measured=measured))
+    rows = apart(pose=[0, 1, 2, 3], pose_2=[1, 2, 3, 5], size=0, measured=measured)
+    problem = jaxba.with_residual(problem, rows, unknowns={"size": [[1.1]]})  # one number of all cameras
     several = compare(problem, "ceres", linear_solver="implicit")
-    blocks = several.problem.residuals.blocks[0]
-    assert (blocks != 1).all()
+    images, size = several.problem.residuals.blocks
+    assert (images != 1).all()
+    assert size != 1.1
 
 
 @pytest.mark.parametrize(
