@@ -98,6 +98,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> int:
             raise ValueError(f"residual {name} cannot be computed: {shown(text, 200)}") from error
         if len(shape) != 2 or not shape[1]:
             raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[:0:-1]}")
+        if len(kind.points) > 1 and shape[1] > POSE_SIZE:  # of the camera that splits it
+            raise ValueError(f"residual {name} has two points in a row, so at most {POSE_SIZE} numbers, not {shape[1]}")
         residual, *derivatives = jax.device_get(jit(model.differentiated)(kind, of, *at))
         bad = np.flatnonzero(~np.isfinite(residual).all(axis=0))
         if bad.size:
@@ -113,10 +115,11 @@ def _check_dependence(kind: ResidualSlots, unknowns: Unknowns, by_camera: np.nda
     numbers = np.array([*range(POSE_SIZE), *(POSE_SIZE + column for column in unknowns.columns)])
     what = f"residual {kind.rows.residual.name}"
     for name, (start, end) in zip(kind.rows.residual.unknowns, kind.places, strict=True):
-        base, which = name.removesuffix(SECOND), int(name.endswith(SECOND) and len(kind.cameras) > 1)
+        base = name.removesuffix(SECOND)
+        which = int(name.endswith(SECOND) and len(kind.points if base == POINT else kind.cameras) > 1)
         lens = POSE_SIZE, POSE_SIZE + unknowns.lens_size
         first, last = {POSE: (0, POSE_SIZE), LENS: lens}.get(base, (start, end))
-        own = by_point if base == POINT else by_camera[:, which, (numbers >= first) & (numbers < last)]
+        own = by_point[:, which] if base == POINT else by_camera[:, which, (numbers >= first) & (numbers < last)]
         if not np.isfinite(own).all():
             raise ValueError(f"the derivative of {what} by {name} is not finite at the start")
         if own.size and not own.any():
@@ -125,9 +128,9 @@ def _check_dependence(kind: ResidualSlots, unknowns: Unknowns, by_camera: np.nda
 
 def _check_differences(kind: ResidualSlots, unknowns: Unknowns, cameras: jax.Array, points: jax.Array) -> None:
     """Raises a ProblemError where derivatives do not agree with central differences in most rows."""
-    few = np.linspace(0, len(kind.point) - 1, min(len(kind.point), CHECKED)).astype(int)
-    cameras_of = tuple(np.asarray(x)[few] for x in kind.cameras)
-    kind = replace(kind, rows=kind.rows.of(few), cameras=cameras_of, point=np.asarray(kind.point)[few])
+    few = np.linspace(0, len(kind.rows) - 1, min(len(kind.rows), CHECKED)).astype(int)
+    cameras_of, points_of = (tuple(np.asarray(x)[few] for x in part) for part in (kind.cameras, kind.points))
+    kind = replace(kind, rows=kind.rows.of(few), cameras=cameras_of, points=points_of)
     random = np.random.default_rng(0)
     change = [random.standard_normal(x.shape) * np.maximum(1.0, np.abs(x)) for x in (cameras, points)]
     at = jit(lambda step: model.values(kind, unknowns, cameras + step * change[0], points + step * change[1]))

@@ -29,6 +29,7 @@ from jaxba.runtime.fusion import compute_unfused, fusion_barrier
 from jaxba.structure.layout import Layout
 from jaxba.structure.residual_slots import ResidualSlots
 from jaxba.structure.segment_sums import take_each
+from jaxba.structure.sharing import Mask
 from jaxba.structure.unknowns import Unknowns
 
 ROOT = math.sqrt(2.0)
@@ -40,7 +41,7 @@ class Linear(NamedTuple):
     at: Array  # slots, flattened
     residual: list[Array]  # [2] of (entries,)
     by_camera: list[list[Array]]  # [2][width]
-    by_point: list[list[Array]]  # [2][3]
+    by_point: list[list[Array]]  # [2][3], by the point of the slot
 
 
 def values(
@@ -59,9 +60,9 @@ def row_costs(rows: Rows, residual: Float[Array, "size rows"]) -> Float[Array, "
 def add_costs(
     layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], costs: Array
 ) -> Float[Array, " slots"]:
-    """Costs of slots with those of all rows, whose cameras have equal parts of them."""
+    """Costs of slots with those of all rows, whose cameras or points have equal parts of them."""
     for rows in layout.residuals:
-        own = row_costs(rows.rows, values(rows, layout.unknowns, cameras, points)) / len(rows.cameras)
+        own = row_costs(rows.rows, values(rows, layout.unknowns, cameras, points)) / rows.slots.shape[1]
         at = jnp.asarray(rows.slots)[0]
         costs = costs.at[at].add(jnp.broadcast_to(own, at.shape), mode="drop")
     return costs
@@ -71,20 +72,31 @@ def add_point_terms(
     layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], sums: list[Array]
 ) -> list[Float[Array, " points"]]:
     """Sums over the observations of points, of the first ten `linearize.point_terms` or of costs alone, with those of
-    all rows: of a row without a point only its cost, at the point that stands for it."""
+    all rows: of a row without a point only its cost, at the point that stands for it, and of one of two points half of
+    it at each, since these do not move alone (`points_alone`)."""
     sums, cost = list(sums), 9 if len(sums) > 1 else 0
     for rows in layout.residuals:
-        at = jnp.asarray(layout.slot_point).at[rows.slots[0, 0]].get(mode="fill", fill_value=layout.num_points)
-        if not cost or POINT not in rows.rows.residual.unknowns:
-            residual = values(rows, layout.unknowns, cameras, points)
-            sums[cost] = sums[cost].at[at].add(row_costs(rows.rows, residual), mode="drop")
+        at = jnp.asarray(layout.slot_point).at[rows.slots[0]].get(mode="fill", fill_value=layout.num_points)
+        if not cost or POINT not in rows.rows.residual.unknowns or len(rows.points) > 1:
+            own = row_costs(rows.rows, values(rows, layout.unknowns, cameras, points))
+            for end in at[: len(rows.points)]:
+                sums[cost] = sums[cost].at[end].add(own / len(rows.points), mode="drop")
             continue
         residual, _, by_point = differentiated(rows, layout.unknowns, cameras, points)
-        weighted = _weight(rows.rows, residual) * by_point  # [size, 3, rows]
+        by_point = by_point[:, 0]  # [size, 3, rows]
+        weighted = _weight(rows.rows, residual) * by_point
         terms = [jnp.sum(weighted[:, i] * by_point[:, j], axis=0) for i in range(3) for j in range(i + 1)]
         terms += [*jnp.sum(weighted * residual[:, None], axis=0), row_costs(rows.rows, residual)]
-        sums[:10] = [x.at[at].add(term, mode="drop") for x, term in zip(sums[:10], terms, strict=True)]
+        sums[:10] = [x.at[at[0]].add(term, mode="drop") for x, term in zip(sums[:10], terms, strict=True)]
     return sums
+
+
+def points_alone(layout: Layout) -> Mask:
+    """Which points may move while all others stay: those that are free, and in no row with another point."""
+    free, pairs = layout.unknowns.free_points, [own for x in layout.residuals if len(x.points) > 1 for own in x.points]
+    if not pairs:
+        return free
+    return Mask(free.where(jnp.ones(layout.num_points, bool).at[jnp.concatenate(pairs)].set(False), False), False)
 
 
 def linearized(
@@ -92,7 +104,7 @@ def linearized(
 ) -> Linear:
     """Residuals and Jacobians of rows, at their slots."""
     residual, by_step, by_move = differentiated(rows, unknowns, cameras, points)
-    root, several = safe_sqrt(_weight(rows.rows, residual)), len(rows.cameras)
+    root, several = safe_sqrt(_weight(rows.rows, residual)), rows.slots.shape[1]
 
     def pairs(x: Array) -> Array:  # [size, ..., rows] as [pairs, 2, ..., rows], weighted
         x = jnp.pad(x * root, [(0, rows.rows.size % 2), *[(0, 0)] * (x.ndim - 1)])
@@ -101,14 +113,16 @@ def linearized(
     residual, by_step, by_move = pairs(residual), pairs(by_step), pairs(by_move)
     shape = rows.slots.shape
     flat = lambda x: jnp.broadcast_to(x, shape).reshape(-1)
-    split = ROOT if several > 1 else 1.0  # of a row of two cameras each has half of the residual
+    split = ROOT if several > 1 else 1.0  # of a row of two cameras or points each has half of the residual
     own = [flat(residual[:, None, k] * (split / several)) for k in range(2)]
     by_camera = [[flat(split * by_step[:, k, :, w]) for w in range(unknowns.width)] for k in range(2)]
-    if several == 1:
-        by_point = [[flat(by_move[:, k, None, i]) for i in range(3)] for k in range(2)]
-    else:  # by the variable that splits it
-        signs = jnp.asarray([[ROOT], [-ROOT]], cameras.dtype)
-        by_point = [[flat(signs if i == k else jnp.zeros_like(signs)) for i in range(3)] for k in range(2)]
+    by_point = [[flat(split * by_move[:, k, :, i]) for i in range(3)] for k in range(2)]
+    signs = jnp.asarray([[ROOT], [-ROOT]], cameras.dtype)
+    if len(rows.cameras) > 1:  # by the variables that split it
+        by_point = [[flat(signs if i == k else 0 * signs) for i in range(3)] for k in range(2)]
+    elif several > 1:
+        which = jnp.arange(len(residual))[:, None, None]
+        by_camera = [[flat(jnp.where(w == 2 * which + k, signs, 0)) for w in range(unknowns.width)] for k in range(2)]
     return Linear(jnp.asarray(rows.slots).reshape(-1), own, by_camera, by_point)
 
 
@@ -123,8 +137,8 @@ def _each(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def differentiated(
     rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
-) -> tuple[Float[Array, "size rows"], Float[Array, "size _ width rows"], Float[Array, "size 3 rows"]]:
-    """The residual of every row, and its Jacobians by steps of its cameras and by its point."""
+) -> tuple[Float[Array, "size rows"], Float[Array, "size _ width rows"], Float[Array, "size _ 3 rows"]]:
+    """The residual of every row, and its Jacobians by steps of its cameras and by its points."""
 
     def backward(*given: Array) -> tuple[Array, tuple[Array, ...]]:
         at = lambda *parameters: _value(rows, unknowns, *parameters, *given[4:])
@@ -154,8 +168,8 @@ def differentiated(
 
 
 def _gathered(rows: ResidualSlots, unknowns: Unknowns, cameras: Array, points: Array) -> tuple[Array, ...]:
-    """What a row needs of the problem, along the last axis: rotations, translations and numbers of its cameras, the
-    point; in a rig M and M t_f; camera models, and the data."""
+    """What a row needs of the problem, along the last axis: rotations, translations and numbers of its cameras, its
+    points; in a rig M and M t_f; camera models, and the data."""
     frames = camera.frames(jnp.asarray(cameras), unknowns)
     rotation, translation, places = jnp.asarray(frames.rotation), jnp.asarray(frames.translation), []
     for place in frames.places:
@@ -169,8 +183,8 @@ def _gathered(rows: ResidualSlots, unknowns: Unknowns, cameras: Array, points: A
     model = jnp.stack([jnp.asarray(unknowns.model)[one] for one in index])
     data = (jnp.moveaxis(jnp.asarray(x, cameras.dtype), 0, -1) for x in rows.rows.data)
     matrices = table[:, :9].reshape(len(index), 3, 3, -1)
-    point = jnp.stack(take_each(points, jnp.asarray(rows.point)))
-    return matrices, table[:, 9:12], table[:, end:], point, table[:, 12:end], model, *data
+    places = jnp.stack([jnp.stack(take_each(points, jnp.asarray(one))) for one in rows.points])
+    return matrices, table[:, 9:12], table[:, end:], places, table[:, 12:end], model, *data
 
 
 def _value(
@@ -179,7 +193,7 @@ def _value(
     rotation: Float[Array, "cameras 3 3"],
     translation: Float[Array, "cameras 3"],
     numbers: Float[Array, "cameras numbers"],
-    point: Float[Array, "3"],
+    points: Float[Array, "points 3"],
     place: Array,
     model: Array,
     *data: Array,
@@ -187,4 +201,4 @@ def _value(
     """The function at one row."""
     given = Cameras(rotation, translation, numbers[:, : unknowns.lens_size], model, unknowns.models)
     blocks = [numbers[:, max(0, first - POSE_SIZE) : max(0, last - POSE_SIZE)] for first, last in rows.places]
-    return value(rows.rows, given, point, blocks, data)
+    return value(rows.rows, given, points, blocks, data)

@@ -82,7 +82,8 @@ def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool
         owners = owners_of(problem, rows, groups)
         for own in owners.cameras:
             cameras[own[own >= 0]] = True
-        points[owners.point[owners.point >= 0]] = True
+        for own in owners.points:
+            points[own[own >= 0]] = True
     return cameras, points
 
 

@@ -112,8 +112,6 @@ def residual(function: Callable[..., Any]) -> Residual:
     unknowns = tuple(p.name for p in found if p.name not in data)
     if not unknowns:
         raise ValueError(f"residual {function.__name__} has no unknown: its positional parameters are unknowns")
-    if POINT + SECOND in unknowns:
-        raise ValueError(f"residual {function.__name__}: two points in one row are not supported")
     return Residual(function, unknowns, data)
 
 
@@ -151,10 +149,10 @@ class Rows(ArrayRecord):
         return len(self.index[0])
 
     @property
-    def point(self) -> Int[np.ndarray, " rows"]:
-        """Point of each row, -1 without one."""
+    def points(self) -> list[Int[np.ndarray, " rows"]]:
+        """One or two points of each row, -1 without one."""
         of = dict(zip(self.residual.unknowns, self.index, strict=True))
-        return np.asarray(of.get(POINT, np.full(len(self), -1)))
+        return [np.asarray(of[x]) for x in (POINT, POINT + SECOND) if x in of] or [np.full(len(self), -1)]
 
     def of(self, kept: Int[np.ndarray, " kept"] | Bool[np.ndarray, " rows"]) -> Rows:
         """Some of the rows."""
@@ -206,9 +204,10 @@ class Residuals(ArrayRecord):
                 kept = np.flatnonzero((own >= 0).any(axis=(1, 2)))
                 rows = replace(rows, observation=own).of(kept if len(kept) else np.zeros(1, int))  # never empty
             else:
-                rows = rows.of((rows.point < 0) | np.isin(rows.point, points))
+                rows = rows.of(np.all([(own < 0) | np.isin(own, points) for own in rows.points], axis=0))
             pairs = zip(rows.residual.unknowns, rows.index, strict=True)
-            index = (np.searchsorted(points, i).astype(np.int32) if name == POINT else i for name, i in pairs)
+            of_point = lambda name: name.removesuffix(SECOND) == POINT
+            index = (np.searchsorted(points, i).astype(np.int32) if of_point(name) else i for name, i in pairs)
             found += [replace(rows, index=tuple(index))] if len(rows) else []
         return replace(self, rows=tuple(found))
 

@@ -18,8 +18,8 @@ from jaxba.problem.row_value import Cameras, value
 from jaxba.rotations import rotation_matrix
 from jaxba.runtime.numerics import numerics
 
-SIMILARITY, OF_ROW = 7, 15
-"""Numbers of a similarity, and of two poses and a point."""
+SIMILARITY, OF_ROW = 7, 18
+"""Numbers of a similarity, and of two poses and two points."""
 
 
 def changes_by_similarity(
@@ -27,7 +27,7 @@ def changes_by_similarity(
 ) -> list[Float[np.ndarray, "numbers 7"]]:
     """For each residual besides those of pixels the derivatives of its numbers by a rotation of the scene about its
     middle, a translation in extents, and the scale, as shares of their largest derivative by one of the row's poses or
-    its point in the same units."""
+    points in the same units."""
     groups = block_groups(problem)
     with numerics(np.float64):
         every = problem.residuals.rows
@@ -47,7 +47,7 @@ def _changes(
     at_rows = [(named.get(name.removesuffix(SECOND)), i) for name, i in pairs]
     blocks = [np.repeat((none if own is None else own[i])[:, None], 2, axis=1) for own, i in at_rows]
 
-    def moved(change: Array, rotation: Array, center: Array, lens: Array, model: Array, point: Array, *rest: Array):
+    def moved(change: Array, rotation: Array, center: Array, lens: Array, model: Array, points: Array, *rest: Array):
         scene, own = change[:SIMILARITY], change[SIMILARITY:].reshape(-1, 3)
         turn = rotation_matrix(scene[:3, None])[:, :, 0]
         move = lambda x: middle + (1 + scene[6]) * (x - middle) @ turn.T + extent * scene[3:6]
@@ -56,14 +56,15 @@ def _changes(
         center = move(center) + extent * own[2 : 2 + len(center)]
         translation = -jnp.einsum("cij,cj->ci", rotation, center)
         of = Cameras(rotation, translation, lens, model, models)
-        return value(rows, of, move(point) + extent * own[4], rest[: len(blocks)], rest[len(blocks) :])
+        points = move(points) + extent * own[4 : 4 + len(points)]
+        return value(rows, of, points, rest[: len(blocks)], rest[len(blocks) :])
 
     given = (
         rotation_matrices(at[:, :3]).reshape(*shape, 3, 3),
         camera_centers(at).reshape(*shape, 3),
         at[:, POSE_SIZE:].reshape(*shape, -1),
         model,
-        np.asarray(problem.points, np.float64)[np.maximum(owners.point, 0)],
+        np.asarray(problem.points, np.float64)[np.maximum(np.stack(owners.points, axis=1), 0)],
         *blocks,
         *rows.data,
     )

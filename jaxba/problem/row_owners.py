@@ -1,4 +1,4 @@
-"""Which cameras and point the rows of residuals belong to."""
+"""Which cameras and points the rows of residuals belong to."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from jaxba.problem.residuals import LENS, POINT, SECOND, Rows
 
 
 class Owners(NamedTuple):
-    """Which cameras and point stand for each row of a residual."""
+    """Which cameras and points stand for each row of a residual: of one of both kinds, or two of one."""
 
-    cameras: list[Int[np.ndarray, " rows"]]  # one or two; -1 for some camera that sees the point
-    point: Int[np.ndarray, " rows"]  # -1 for none
+    cameras: list[Int[np.ndarray, " rows"]]  # -1 for some camera that sees the point
+    points: list[Int[np.ndarray, " rows"]]  # -1 for none
 
 
 def block_groups(problem: BundleProblem) -> list[Int[np.ndarray, " cameras"]]:
@@ -68,7 +68,8 @@ def owners_of(problem: BundleProblem, rows: Rows, groups: list[Int[np.ndarray, "
         ProblemError: unknowns of a row are not of one camera, or a row has more than can be laid out.
     """
     names, cameras, blocks = rows.residual.unknowns, [], problem.residuals.names
-    for ending in dict.fromkeys(SECOND * name.endswith(SECOND) for name in names if name != POINT):
+    of_cameras = (name for name in names if name.removesuffix(SECOND) != POINT)
+    for ending in dict.fromkeys(SECOND * name.endswith(SECOND) for name in of_cameras):
         camera = _named_camera(problem, rows, ending)
         for name, index in zip(names, rows.index, strict=True):
             if name.removesuffix(ending) in blocks and (camera < 0).any():
@@ -78,6 +79,8 @@ def owners_of(problem: BundleProblem, rows: Rows, groups: list[Int[np.ndarray, "
         if (camera < 0).any():
             raise ProblemError(f"residual {rows.residual.name}: no residual says which cameras have its unknowns")
         cameras.append(camera)
-    if len(cameras) == 2 and POINT in names:
-        raise ProblemError(f"residual {rows.residual.name}: two cameras and a point in one row are not supported")
-    return Owners(cameras or [np.full(len(rows), -1)], rows.point)
+    points = sum(name.removesuffix(SECOND) == POINT for name in names)
+    if len(cameras) * points > 1:
+        what = "a camera and two points" if points == 2 else "two cameras and a point"
+        raise ProblemError(f"residual {rows.residual.name}: {what} in one row are not supported")
+    return Owners(cameras or [np.full(len(rows), -1)], rows.points)

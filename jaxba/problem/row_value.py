@@ -79,14 +79,18 @@ class Cameras(NamedTuple):
 
 
 def value(
-    rows: Rows, cameras: Cameras, point: Array, blocks: Sequence[Float[Array, "cameras _"]], data: Sequence[Array]
+    rows: Rows,
+    cameras: Cameras,
+    points: Float[Array, "points 3"],
+    blocks: Sequence[Float[Array, "cameras _"]],
+    data: Sequence[Array],
 ) -> Float[Array, " size"]:
     """The function of a residual at one row.
 
     Args:
         rows: the function, and the frame that it sees.
         cameras: of the row.
-        point: of the row; anything if it has none.
+        points: of the row; anything if it has none.
         blocks: for each unknown of the function its block, of each camera.
         data: for each keyword of the function its value.
     """
@@ -94,9 +98,10 @@ def value(
     scale, turn, shift, axes = (jnp.asarray(x, dtype) for x in (rows.scale, rows.rotation, rows.translation, AXES))
     arguments: list[Any] = []
     for name, block in zip(rows.residual.unknowns, blocks, strict=True):
-        base, which = name.removesuffix(SECOND), int(name.endswith(SECOND) and len(cameras.rotation) > 1)
+        base = name.removesuffix(SECOND)
+        which = int(name.endswith(SECOND) and len(points if base == POINT else cameras.rotation) > 1)
         if base == POINT:
-            arguments.append(scale * _times(turn, point) + shift)
+            arguments.append(scale * _times(turn, points[which]) + shift)
         elif base == POSE:
             rotation = jnp.stack([_times(turn, row) for row in cameras.rotation[which]])
             moved = scale * cameras.translation[which] - _times(rotation, shift)

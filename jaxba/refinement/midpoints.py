@@ -16,7 +16,7 @@ from jaxba.linear.cholesky3 import cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import slot_costs, view_residuals
 from jaxba.model.observations import Views, point_passes
-from jaxba.model.residuals import add_point_terms
+from jaxba.model.residuals import add_point_terms, points_alone
 from jaxba.problem.losses import Loss
 from jaxba.refinement.points import PreviousPoints, has_receded, refine_points
 from jaxba.runtime import loops
@@ -102,7 +102,7 @@ def choose_starts(
     own, costs = (add_point_terms(layout, cameras, at, [sums])[0] for at, sums in ((points, own), (middle, costs)))
     diverged = (own_lost > 0) | has_receded(own_inverse_depth, previous.inverse_depth_sum)
     possible = (lost == 0) & ~has_receded(other_inverse_depth, previous.inverse_depth_sum) & jnp.isfinite(costs)
-    possible = layout.unknowns.free_points.where(possible, False)
+    possible = points_alone(layout).where(possible, False)
     better = possible & ((costs < own) | diverged)
     return jnp.stack([jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points)])
 

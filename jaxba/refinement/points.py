@@ -29,7 +29,7 @@ from jaxba.linear.cholesky3 import cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import Reference, point_terms
 from jaxba.model.observations import Views, point_passes
-from jaxba.model.residuals import add_point_terms
+from jaxba.model.residuals import add_point_terms, points_alone
 from jaxba.problem.losses import Loss
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_in_one_loop
@@ -127,7 +127,7 @@ def refine_points(
         reset points is the previous position.
     """
     one_pass = point_passes(layout, frames)
-    before = previous or PreviousPoints.unknown(layout, points)
+    before, alone = previous or PreviousPoints.unknown(layout, points), points_alone(layout)
 
     def terms(views: Views, front: Array) -> list[Array]:
         found = point_terms(views, loss)
@@ -137,6 +137,7 @@ def refine_points(
         *found, inverse_depth_sum, lost = one_pass(now.trial, terms, before.front)
         *system, costs = add_point_terms(layout, cameras, now.trial, found)
         diverged = (now.passes == 0) & ((lost > 0) | has_receded(inverse_depth_sum, before.inverse_depth_sum))
+        diverged = alone.where(diverged, False)
         delayed = now.delayed | diverged
         start = jnp.where(jnp.isinf(now.costs), inverse_depth_sum, now.inverse_depth_sum)
         active = ~diverged & (delayed | (now.passes <= iterations))
@@ -149,7 +150,7 @@ def refine_points(
         damping = jnp.where(diverged, now.damping, jnp.where(accepted, now.damping / DAMPING_FACTOR, grown))
         best = jnp.where(accepted, now.trial, now.points)
         system = jnp.where(accepted, jnp.stack(system), now.system)
-        trial = jnp.stack(compute_in_one_loop(_moved, best, system, damping, layout.unknowns.free_points))
+        trial = jnp.stack(compute_in_one_loop(_moved, best, system, damping, alone))
         return _Search(
             points=jnp.where(diverged, before.points, best),
             costs=least,

@@ -39,6 +39,7 @@ from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.place import check_problem, placed
 from jaxba.structure.layout import Layout, build_layout
+from jaxba.structure.unknowns import Unknowns
 from jaxba.typing import ArrayRecord
 
 UNDETERMINED = 1e-9
@@ -152,15 +153,15 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
         matrices[lost[:, :, None] | lost[:, None]] = np.nan
     lost = np.linalg.norm(null, axis=1) > COMPONENT
     of_cameras = np.where(lost[:, None] | lost, np.nan, inverse)
-    seen = np.asarray(layout.camera_seen)
     cameras = np.asarray(given.cameras)
+    seen, index = np.asarray(layout.camera_seen)[: len(cameras)], index[: len(cameras)]
     rotations = geometry.rotation_matrices(cameras[:, :3])
     changes = _changes(problem, layout, rotations, offset)
     pairs = zip(changes, index, strict=True)
     poses = np.array([_through(change, _submatrix(of_cameras, row)) for change, row in pairs])
     poses[~seen] = np.nan
-    lenses = _of_lenses(problem, layout, index, of_cameras)
-    unseen = np.setdiff1d(np.arange(len(lenses)), np.asarray(every_lens(problem).index)[seen])
+    lenses = _of_lenses(counted, layout.unknowns, seen, index, of_cameras)
+    unseen = np.setdiff1d(np.arange(len(lenses)), np.asarray(every_lens(counted).index)[seen])
     has = lambda x: np.isnan(x).any(axis=(1, 2))
     undetermined: dict[Part, np.ndarray] = {
         "image": np.flatnonzero(has(poses) & seen),
@@ -184,9 +185,9 @@ def _changes(
     changes = np.tile(np.eye(POSE_SIZE, unknowns.width), (len(rotations), 1, 1))
     if unknowns.in_rigs:
         assert problem.rigs is not None
-        turn = np.asarray(problem.rigs.rotation)
+        turn = np.asarray(problem.rigs.rotation)[: len(rotations)]
         changes[:, :3, :3] = changes[:, 3:6, 3:6] = turn
-        moved = np.einsum("nij,nj->ni", turn, np.asarray(problem.cameras)[:, 3:6])
+        moved = np.einsum("nij,nj->ni", turn, np.asarray(problem.cameras)[: len(rotations), 3:6])
         by_extrinsics = np.tile(np.eye(EXTRINSICS_SIZE), (len(rotations), 1, 1))
         by_extrinsics[:, 3:, :3] = -geometry.cross_matrices(moved)
         start = unknowns.lens_size
@@ -344,14 +345,14 @@ def _marginal(
 
 
 def _of_lenses(
-    problem: BundleProblem, layout: Layout, index: np.ndarray, of_cameras: np.ndarray
+    problem: BundleProblem, unknowns: Unknowns, seen: np.ndarray, index: np.ndarray, of_cameras: np.ndarray
 ) -> Float[np.ndarray, "lenses numbers numbers"]:
     lenses = every_lens(problem)
     size = lens_size(problem.lenses)
     found = np.full((len(lenses.free), size, size), np.nan)
-    for camera in np.flatnonzero(layout.camera_seen):
+    for camera in np.flatnonzero(seen):
         rows = np.full(size, -1)
-        for k, column in enumerate(layout.unknowns.columns):
+        for k, column in enumerate(unknowns.columns):
             if column < size:
                 rows[column] = index[camera, POSE_SIZE + k]
         found[lenses.index[camera]] = _submatrix(of_cameras, rows)

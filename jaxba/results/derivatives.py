@@ -185,7 +185,8 @@ def _symmetries(
     free, in all numbers of cameras and points; and the directions in which rays determine points, in layout order."""
     order, determined = np.asarray(layout.points), determined_directions(solved)
     cameras, points = free_directions(solved)
-    cameras = np.pad(cameras, ((0, 0), (0, 0), (0, sum(layout.unknowns.own_sizes))))
+    more = layout.num_cameras - solved.num_cameras
+    cameras = np.pad(cameras, ((0, 0), (0, more), (0, sum(layout.unknowns.own_sizes))))
     cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
     # only what of it is not already a motion of points along their rays
     points = np.einsum("pij,kpj->kpi", determined, points)
@@ -212,7 +213,7 @@ def _solve_transposed(
     state = initial_state(layout, solved, options, jnp.float64)
     unknowns, order = layout.unknowns, layout.points
     count, end = state.cameras.shape[1], len(state.cameras) - sum(unknowns.own_sizes)
-    seen = jnp.asarray(layout.camera_seen)[:, None]
+    seen, given = jnp.asarray(layout.camera_seen)[:, None], len(inputs.cameras)
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
         """On the unknowns that a minimum determines, orthogonally."""
@@ -230,6 +231,7 @@ def _solve_transposed(
 
     def of_frames(cameras: AnyArray) -> Array:
         """Cameras as the inputs have them, as those of the state."""
+        cameras = jnp.concatenate([cameras, state.cameras[: cameras.shape[1], len(cameras) :].T])
         if not unknowns.in_rigs:
             return jnp.concatenate([cameras, state.cameras[end:].T], axis=1)
         place = state.cameras[end - EXTRINSICS_SIZE : end]
@@ -243,9 +245,9 @@ def _solve_transposed(
         """Parameters as the solution has them."""
         cameras, points = moved(y, theta)
         if not unknowns.in_rigs:
-            return cameras[:end], points
+            return cameras[:end, :given], points
         own = cameras[POSE_SIZE : end - EXTRINSICS_SIZE]
-        return jnp.concatenate([*camera.poses(cameras, unknowns), own]), points
+        return jnp.concatenate([*camera.poses(cameras, unknowns), own])[:, :given], points
 
     def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
         in_slots = lambda x: jnp.where(layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., slots], 0)

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.lm.step import initial_state
 from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, point_passes
-from jaxba.model.residuals import add_point_terms
+from jaxba.model.residuals import add_point_terms, points_alone
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import facing_away
@@ -143,10 +143,11 @@ def _search(
         costs, hidden = one_pass(points, terms)
         return add_point_terms(layout, state.cameras, points, [costs])[0], hidden
 
-    own, hidden = evaluate(start)
+    (own, hidden), alone = evaluate(start), points_alone(layout)
 
     def try_start(best: tuple[Array, Array], position: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
+        position = alone.where(position, start)
         trial, _ = refine_points(layout, state.cameras, frames, position, loss, POINT_ITERATIONS)
         trial_costs, lost = evaluate(trial)
         better = (trial_costs < costs) & (lost <= hidden)
@@ -154,7 +155,7 @@ def _search(
 
     starts = [origin + factor * (start - origin) for factor in START_DISTANCES] + [midpoints(layout, frames)]
     (points, costs), _ = lax.scan(try_start, (start, own), jnp.stack(starts))
-    costs = layout.unknowns.free_points.where(costs, own)
+    costs = alone.where(costs, own)
     moved = own - costs > jnp.maximum(MIN_RELATIVE_GAIN * own, MIN_GAIN * jnp.mean(costs))
     before = jnp.sum(own)
     # XLA may sum the same numbers in two orders: where nothing moves the cost stays to the last digit

@@ -21,6 +21,8 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.method import check_plain
@@ -77,7 +79,7 @@ class Shards:
         self._options, self._devices = options, devices
         self._mesh = Mesh(np.array(devices), (AXIS,))
         tracks = np.bincount(problem.point_index, minlength=problem.num_points)
-        dealt = deal_points(tracks, len(devices))
+        dealt = deal_points(tracks, len(devices), [rows.points for rows in problem.residuals.rows])
         if not len(dealt[-1]):
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         own = [shard_of(problem, points) for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
@@ -178,12 +180,23 @@ def _run(
     return on_all(layout, carry, policy, tolerances, limit)
 
 
-def deal_points(tracks: Int[np.ndarray, " points"], shards: int) -> list[Int[np.ndarray, " _"]]:
-    """The observed points of each shard, ascending: dealt by track length, forwards and backwards in turns."""
+def deal_points(
+    tracks: Int[np.ndarray, " points"], shards: int, together: Sequence[Sequence[Int[np.ndarray, " _"]]] = ()
+) -> list[Int[np.ndarray, " _"]]:
+    """The observed points of each shard, ascending: dealt by track length, forwards and backwards in turns; but
+    together those that a row of a residual has."""
     order = np.argsort(-tracks, kind="stable")[: np.count_nonzero(tracks)]
     turn, position = np.divmod(np.arange(len(order)), shards)
     shard = np.where(turn % 2 == 0, position, shards - 1 - position)
-    return [np.sort(order[shard == number]) for number in range(shards)]
+    of_point = np.full(len(tracks), -1)
+    of_point[order] = shard
+    pairs = [own for own in together if len(own) == 2]
+    if pairs:
+        first, second = (np.concatenate([own[k] for own in pairs]) for k in range(2))
+        graph = coo_array((np.ones(len(first)), (first, second)), (len(tracks), len(tracks)))
+        _, group = connected_components(graph, directed=False)
+        of_point = np.where(of_point < 0, -1, of_point[np.unique(group, return_index=True)[1]][group])
+    return [np.flatnonzero(of_point == number) for number in range(shards)]
 
 
 def shard_of(problem: BundleProblem, points: Int[np.ndarray, " kept"]) -> BundleProblem:

@@ -10,16 +10,19 @@ and its first-order changes by the two cameras,
     min_v  |sqrt(2) (r/2 + a + v)|^2 + |sqrt(2) (r/2 + b - v)|^2  =  |r + a + b|^2
 
 so that eliminating v like any point gives the block of the two cameras. Damping also holds v, by the share lambda.
+A row of two points is split in the same way by numbers of the pose of a new camera.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.constants import Constants
 from jaxba.problem.residuals import SECOND, Residuals, Rows
 from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.structure.agreement import Agreement
@@ -40,11 +43,12 @@ class ResidualSlots(ArrayRecord):
     cameras: tuple[Int[AnyArray, " rows"], ...]
     """One or two cameras of each row."""
 
-    point: Int[AnyArray, " rows"]
-    """Point of each row, in layout order; any if the function takes none."""
+    points: tuple[Int[AnyArray, " rows"], ...]
+    """One or two points of each row, in layout order; any if the function takes none."""
 
-    slots: Int[AnyArray, "pairs cameras rows"]
-    """Slots of each row: of each pair of numbers, and each camera; out of range where there is none."""
+    slots: Int[AnyArray, "pairs ends rows"]
+    """Slots of each row: of each pair of numbers, and each of its one or two cameras or points; out of range where
+    there is none."""
 
     places: tuple[tuple[int, int], ...] = field(metadata={"static": True})
     """For each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
@@ -53,7 +57,7 @@ class ResidualSlots(ArrayRecord):
 
 def laid_out(problem: BundleProblem) -> BundleProblem:
     """A problem `in_frames` with its blocks after the numbers of cameras, and observations that stand for its residuals
-    after those of pixels, with new points where they need them. Without residuals it is the problem itself.
+    after those of pixels, with new points and cameras where they need them. Without residuals it is the problem itself.
 
     Raises:
         ProblemError: see `owners_of`.
@@ -62,35 +66,48 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
     if not residuals:
         return problem
     camera, point = [np.asarray(problem.camera_index)], [np.asarray(problem.point_index)]
-    observations, points, found, groups = problem.num_observations, problem.num_points, [], block_groups(problem)
+    observations, points, cameras = problem.num_observations, problem.num_points, problem.num_cameras
+    found, groups = [], block_groups(problem)
     sees = np.zeros(problem.num_points, int)
     sees[point[0]] = camera[0]
     for rows in residuals.rows:
         owners, pairs = owners_of(problem, rows, groups), -(-rows.size // 2)
-        shape = (len(rows), pairs, len(owners.cameras))
-        own = [np.where(c < 0, sees[np.maximum(owners.point, 0)], c) for c in owners.cameras]
-        if len(own) == 2:  # a point for each pair of residuals
-            at = points + np.arange(len(rows) * pairs).reshape(-1, pairs)
-        else:
-            at = np.where(owners.point < 0, points + np.arange(len(rows)), owners.point)[:, None]
-        points = max(points, int(at.max(initial=-1)) + 1)
-        camera.append(np.broadcast_to(np.stack(own, axis=1)[:, None], shape).ravel())
-        point.append(np.broadcast_to(at[:, :, None], shape).ravel())
+        shape = (len(rows), pairs, max(len(owners.cameras), len(owners.points)))
+        own = [np.where(c < 0, sees[np.maximum(p, 0)], c) for c, p in itertools.product(*owners)]
+        at = [np.where(p < 0, points + np.arange(len(rows)), p) for p in owners.points]
+        if len(owners.points) == 2:  # a camera for all numbers
+            own = [cameras + np.arange(len(rows))] * 2
+        at = np.stack(at, axis=1)[:, None]
+        if len(owners.cameras) == 2:  # a point for each pair of numbers
+            at = points + np.arange(len(rows) * pairs).reshape(-1, pairs, 1)
+        own = np.stack(own, axis=1)[:, None]
+        points, cameras = (max(x, int(y.max(initial=-1)) + 1) for x, y in ((points, at), (cameras, own)))
+        camera.append(np.broadcast_to(own, shape).ravel())
+        point.append(np.broadcast_to(at, shape).ravel())
         size = len(camera[-1])
         found.append(replace(rows, observation=observations + np.arange(size).reshape(shape)))
         observations += size
     more, extra = observations - problem.num_observations, points - problem.num_points
     rest = lambda x, count: np.concatenate([np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)])
-    held, pairs = problem.constants, zip(residuals.blocks, groups, strict=True)
+    new = np.arange(cameras - problem.num_cameras)
+    groups = [np.append(own, -cameras + new) for own in groups]
+    every = np.append(np.arange(problem.num_cameras), 0 * new)  # new ones have the lens of the first
+    held, rigs, pairs = problem.constants, problem.rigs, zip(residuals.blocks, groups, strict=True)
     blocks = (np.where((own >= 0)[:, None], np.asarray(x)[np.maximum(own, 0)], 0.0) for x, own in pairs)
+    if held is not None:
+        held = Constants(rest(held.poses, len(new)), rest(held.points, extra))
+    if rigs is not None:
+        rigs = replace(rigs.of(every), frame=np.append(rigs.frame, np.max(rigs.frame) + 1 + new).astype(np.int32))
     return problem.replace(
-        cameras=np.hstack([np.asarray(problem.cameras), *blocks]),
+        cameras=np.hstack([np.asarray(problem.cameras)[every], *blocks]),
         points=rest(problem.points, extra),
         observations=rest(problem.observations, more),
         camera_index=np.concatenate(camera).astype(np.int32),
         point_index=np.concatenate(point).astype(np.int32),
         whitening=None if problem.whitening is None else rest(problem.whitening, more),
-        constants=None if held is None else replace(held, points=rest(held.points, extra)),
+        lenses=None if problem.lenses is None else problem.lenses.of(every),
+        constants=held,
+        rigs=rigs,
         residuals=replace(residuals, rows=tuple(found), groups=tuple(groups)),
     )
 
@@ -142,12 +159,13 @@ def residual_slots(
         rows = rows.of(np.where(lost, 0, kept))
         observation = np.where(lost[:, None, None], -1, rows.observation)
         own = np.where(observation < 0, NOWHERE, slot_of[observation]).astype(np.int32)
-        camera = np.asarray(problem.camera_index)[observation.max(axis=1)]
+        own_cameras = slice(2 if len(rows.points) == 1 else 1)  # both ends of a row of two points have the same camera
+        camera = np.asarray(problem.camera_index)[observation.max(axis=1)[:, own_cameras]]
         found.append(
             ResidualSlots(
                 rows=rows,
                 cameras=tuple(camera.T),
-                point=order[np.maximum(rows.point, 0)],
+                points=tuple(order[np.maximum(own, 0)] for own in rows.points),
                 slots=np.moveaxis(own, 0, 2),
                 places=tuple(places.get(name.removesuffix(SECOND), (0, 0)) for name in rows.residual.unknowns),
             )

@@ -8,7 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_rows import CAMERAS, POINTS, control_point, depth, example, pose, position, relative_pose, scene, whole
+from test_rows import (
+    CAMERAS,
+    POINTS,
+    apart,
+    control_point,
+    depth,
+    example,
+    pose,
+    position,
+    relative_pose,
+    scene,
+    whole,
+)
 
 import jaxba
 from jaxba.problem import geometry
@@ -54,6 +66,16 @@ def shared(pose, sensor, *, at):
     return pose.center * sensor - at
 
 
+@jaxba.residual
+def between_points(pose, point, point_2):
+    return pose.to_camera(point) - point_2
+
+
+@jaxba.residual
+def many(point, point_2):
+    return jnp.outer(point, point_2).ravel()
+
+
 def refused():
     ones = {"at": 0.0, "sigma": 1.0}
     of = lambda rows, **more: lambda p: jaxba.with_residual(p, rows, **more)
@@ -80,7 +102,14 @@ def refused():
         ),
         "no parameter of it": (of(position(pose=0, **ones), unknowns={"foo": [[1.0]]}), "unknown foo is no parameter"),
         "no dict": (of(position(pose=0, **ones), unknowns=[1]), "unknowns a dict"),
-        "two points": (lambda _: jaxba.residual(lambda point, point_2: point - point_2), "two points in one row"),
+        "two points with a camera": (
+            of(between_points(pose=0, point=0, point_2=1)),
+            "between_points: a camera and two points in one row are not supported",
+        ),
+        "many numbers of two points": (
+            of(many(point=0, point_2=1)),
+            "two points in a row, so at most 6 numbers, not 9",
+        ),
         "no function": (lambda _: jaxba.residual(3), "made of a function"),
         "a taken name": (of(position(pose=0, **ones), unknowns={"lens": [[1.0]]}), "may not be named lens"),
         "two cameras": (
@@ -111,20 +140,23 @@ def test_what_is_wrong_with_a_residual_is_said_in_one_line(what, unchecked):
 
 
 def everything() -> jaxba.BundleProblem:
-    """Positions, depths with a block for each camera, and relative poses in one problem."""
+    """Positions, depths with a block for each camera, relative poses, and scale bars in one problem."""
     problem = example("depth")[0]
     centers = geometry.camera_centers(problem.cameras)
     problem = jaxba.with_residual(problem, position(pose=[0, 2], at=centers[[0, 2]] + 0.01, sigma=0.1))
     turn, shift = np.eye(3), np.array([1.0, 0.0, 0.0])
     rows = relative_pose(pose=[0, 1], pose_2=[1, 2], turn=turn[None], shift=shift, sigma=2.0)
-    return jaxba.with_residual(problem, rows, loss=jaxba.Loss("cauchy"))
+    problem = jaxba.with_residual(problem, rows, loss=jaxba.Loss("cauchy"))
+    change = problem.points[[9, 5]] - problem.points[[0, 4]]
+    by = np.hstack([np.linalg.norm(change, axis=1)[:, None], change]) / 0.1 + 0.5
+    return jaxba.with_residual(problem, apart(point=[0, 4], point_2=[9, 5], by=by, sigma=0.1))
 
 
 def test_a_moved_scene_has_the_same_residuals_and_the_same_end():
     problem = everything()
     options = jaxba.SolveOptions(max_iterations=60)
     there = jaxba.solve(problem, "ceres", options)
-    assert list(there.costs) == ["pixels", "depth", "position", "relative_pose"]
+    assert list(there.costs) == ["pixels", "depth", "position", "relative_pose", "apart"]
     pixels = 0.5 * np.sum(geometry.residuals(there.problem) ** 2)
     assert there.costs["pixels"] == pytest.approx(pixels, rel=1e-9)
     here = jaxba.solve(jaxba.normalize(problem), "ceres", options)
@@ -140,10 +172,11 @@ def test_invalid_observations_are_dropped_and_residuals_stay():
     points[4] = centers.mean(axis=0) + 3 * (centers.mean(axis=0) - points[4])  # behind all of its cameras
     kept = jaxba.drop_invalid(problem.replace(points=points))
     assert kept.num_points == POINTS - 1
-    of = dict(zip(["depth", "position", "relative_pose"], kept.residuals.rows, strict=True))
-    assert len(of["depth"]) == np.sum(problem.residuals.rows[0].point != 4)
-    before = problem.residuals.rows[0].point
-    np.testing.assert_array_equal(kept.points[of["depth"].point], points[before[before != 4]])
+    of = dict(zip(["depth", "position", "relative_pose", "apart"], kept.residuals.rows, strict=True))
+    before, after = problem.residuals.rows[0].points[0], of["depth"].points[0]
+    np.testing.assert_array_equal(kept.points[after], points[before[before != 4]])
+    np.testing.assert_array_equal([own[0] for own in of["apart"].points], [0, 8])
+    assert len(of["apart"]) == 1
 
 
 def test_derivatives_by_the_data_are_those_of_differences():
@@ -163,7 +196,7 @@ def test_a_problem_with_residuals_can_be_pickled_and_compared():
         everything(), geometry.camera_centers(scene().cameras), stddev=1.0, align=False
     )
     assert pickle.loads(pickle.dumps(problem)) == problem
-    assert "2 rows of position, 2 rows of relative_pose, 5 rows of position_prior" in repr(problem)
+    assert "2 rows of position, 2 rows of relative_pose, 2 rows of apart, 5 rows of position_prior" in repr(problem)
 
 
 def test_points_are_looked_for_anew_with_all_residuals():
@@ -186,8 +219,9 @@ def test_other_types_and_levels_of_compilation_end_at_the_same_cost():
 
 
 @pytest.mark.slow
-def test_covariances_are_those_of_the_dense_inverse():
-    problem, rows = example("depth")
+@pytest.mark.parametrize("kind", ["depth", "apart"])
+def test_covariances_are_those_of_the_dense_inverse(kind):
+    problem, rows = example(kind)
     problem = jaxba.hold(problem, poses=[0, 1])
     solved = jaxba.solve(problem, "ceres", jaxba.SolveOptions(max_iterations=200)).problem
     x, residuals = whole(solved, rows)

@@ -51,6 +51,13 @@ def drift(pose, pose_2, clock, clock_2, *, measured):
 
 
 @jaxba.residual
+def apart(point, point_2, *, by, sigma):
+    """Of points: their distance, and by how much each axis differs."""
+    change = point_2 - point
+    return jnp.concatenate([jnp.linalg.norm(change)[None], change]) / sigma - by
+
+
+@jaxba.residual
 def reprojection(pose, lens, point, *, pixel):
     return lens.project(pose.to_camera(point)) - pixel
 
@@ -90,6 +97,7 @@ KINDS = {
     "depth": "pose, point and a block for each camera",
     "relative": "two poses",
     "drift": "two poses and a block for all cameras",
+    "apart": "two points",
 }
 
 
@@ -142,16 +150,27 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
 
         given = turn, np.array(moved)
         return found, lambda cameras, points, _: jax.vmap(of)(cameras[first], cameras[second], *given)
+    if kind == "apart":
+        first, second = np.array([0, 3, 5, 5]), np.array([7, 8, 0, 9])
+        change = problem.points[second] - problem.points[first]
+        by = np.hstack([np.linalg.norm(change, axis=1)[:, None], change]) / 0.02 + rng.standard_normal((4, 4))
+        found = add(problem, apart(point=first, point_2=second, by=by, sigma=0.02))
+
+        def of_points(cameras, points, _):
+            change = points[second] - points[first]
+            return jnp.hstack([jnp.sqrt(jnp.sum(change**2, axis=1))[:, None], change]) / 0.02 - by
+
+        return found, of_points
     first, second = np.arange(CAMERAS - 1), np.arange(1, CAMERAS)
     measured = np.sum((centers[first] - centers[second]) ** 2, axis=1) * 1.1
     zero = np.zeros(CAMERAS - 1, int)
     rows = drift(pose=first, pose_2=second, clock=zero, clock_2=zero, measured=measured)
     found = add(problem, rows, unknowns={"clock": [[0.05]]})
 
-    def apart(one, other, clock, measured):
+    def drifted(one, other, clock, measured):
         return 5.0 * (jnp.sum((center(one) - center(other)) ** 2) * (1 + clock[0]) - clock[0] - measured)
 
-    return found, lambda cameras, points, blocks: jax.vmap(apart, (0, 0, None, 0))(
+    return found, lambda cameras, points, blocks: jax.vmap(drifted, (0, 0, None, 0))(
         cameras[first], cameras[second], blocks[0][0], measured
     )
 
@@ -173,7 +192,7 @@ def whole(problem: jaxba.BundleProblem, rows) -> tuple[np.ndarray, object]:
     return np.concatenate([np.ravel(x) for x in parts]), residuals
 
 
-QUICK = ("depth", "drift")
+QUICK = ("depth", "drift", "apart")
 SLOW = [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow, id=what) for kind, what in KINDS.items()]
 
 
@@ -201,7 +220,7 @@ def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
     ],
 )
 def test_all_solvers_and_refinements_find_the_same_minimum(policy, linear_solver):
-    for kind in ("depth", "relative"):
+    for kind in ("depth", "relative", "apart"):
         problem, _ = example(kind)
         truth = jaxba.solve(problem, "ceres").final_cost
         options = jaxba.SolveOptions(linear_solver=linear_solver)

@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
@@ -75,6 +76,11 @@ def apart(pose, pose_2, size, *, measured):
     return 10 * (pose.center - pose_2.center - size[0] * measured)
 
 
+@jaxba.residual
+def bar(point, point_2, *, length):
+    return jnp.linalg.norm(point - point_2) * 20 - length
+
+
 def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
     problem = support.tiny()
     camera, point = problem.camera_index[::5], problem.point_index[::5]
@@ -84,6 +90,7 @@ def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
     measured = centers[[0, 1, 2, 3]] - centers[[1, 2, 3, 5]] + 0.01
     rows = apart(pose=[0, 1, 2, 3], pose_2=[1, 2, 3, 5], size=0, measured=measured)
     problem = jaxba.with_residual(problem, rows, unknowns={"size": [[1.1]]})  # one number of all cameras
+    problem = jaxba.with_residual(problem, bar(point=[0, 1, 2], point_2=[3, 2, 9], length=60.0))
     several = compare(problem, "ceres", linear_solver="implicit")
     images, size = several.problem.residuals.blocks
     assert (images != 1).all()
