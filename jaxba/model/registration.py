@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba.model import residuals as model
+from jaxba.model import row_derivatives as model
+from jaxba.model.residuals import row_costs
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.checks import shown
 from jaxba.problem.frames import in_frames
@@ -70,7 +71,7 @@ def costs_by_kind(problem: BundleProblem) -> dict[str, float]:
     with numerics(np.float64):
         kinds, of, at = _rows_of(problem)
         for kind in kinds:
-            costs = model.row_costs(kind.rows, jit(model.values)(kind, of, *at))
+            costs = row_costs(kind.rows, jit(model.values)(kind, of, *at))
             name = kind.rows.residual.name
             found[name] = found.get(name, 0.0) + float(jnp.sum(costs))
     return found
@@ -100,7 +101,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> int:
             raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[:0:-1]}")
         if len(kind.points) > 1 and shape[1] > POSE_SIZE:  # of the camera that splits it
             raise ValueError(f"residual {name} has two points in a row, so at most {POSE_SIZE} numbers, not {shape[1]}")
-        residual, *derivatives = jax.device_get(jit(model.differentiated)(kind, of, *at))
+        kind = replace(kind, rows=replace(kind.rows, size=shape[1], loss=Loss()))
+        residual, *derivatives = map(np.array, jax.device_get(jit(_differentiated)(kind, of, *at)))
         bad = np.flatnonzero(~np.isfinite(residual).all(axis=0))
         if bad.size:
             where = f"row {bad[0]}: {shown(residual[:, bad[0]])}"
@@ -108,6 +110,10 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> int:
         _check_dependence(kind, of, *derivatives)
         _check_differences(kind, of, *at)
     return shape[1]
+
+
+def _differentiated(*given: Any) -> list[Any]:
+    return [numbers.tolist() for numbers in model.differentiated(*given)[:3]]
 
 
 def _check_dependence(kind: ResidualSlots, unknowns: Unknowns, by_camera: np.ndarray, by_point: np.ndarray) -> None:
