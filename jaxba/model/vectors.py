@@ -18,17 +18,16 @@ from jax import Array
 from jax.extend.core import Literal
 from jaxtyping import Shaped
 
-CALLS, MOVES, ELEMENTWISE = (
+CALLS, ELEMENTWISE = (
     frozenset(names.split())
     for names in (
         "jit pjit",
-        "broadcast_in_dim concatenate copy expand_dims reshape rev slice split squeeze stack transpose unstack",
-        """abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh div eq erf
-        exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem
+        """abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh div eq
+        erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem
         round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""",
     )
 )
-"""Primitives that hold a function, that only move numbers, and that compute each from those at its place."""
+"""Primitives that hold a function, and that compute each number from those at its place."""
 
 Numbers = Shaped[np.ndarray, "..."]
 """Vectors or scalars of JAX in an array of objects, of the shape of an array of one row."""
@@ -38,6 +37,30 @@ def numbers_of(x: Array, rank: int) -> Numbers:
     """The numbers of an array over rows, of which so many axes are those of one row."""
     shape = x.shape[:rank]
     return filled([x[place] for place in np.ndindex(shape)], shape)
+
+
+def _broadcast(x: Numbers, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: Any) -> Numbers:
+    axes = [k for k in range(len(shape)) if k not in broadcast_dimensions]
+    return np.broadcast_to(np.expand_dims(x, axes), shape)
+
+
+def _sliced(x: Numbers, start_indices: Any, limit_indices: Any, strides: Any) -> Numbers:
+    return x[tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))]
+
+
+MOVES: dict[str, Callable[..., Any]] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
+    "reshape": lambda x, new_sizes, **_: x.reshape(new_sizes),
+    "rev": lambda x, dimensions: np.flip(x, dimensions),
+    "slice": _sliced,
+    "split": lambda x, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "stack": lambda *parts, axis, **_: np.stack(parts, axis),
+    "transpose": lambda x, permutation: x.transpose(permutation),
+    "unstack": lambda x, axis, **_: [np.squeeze(one, axis) for one in np.split(x, x.shape[axis], axis)],
+}
+"""Primitives that only move numbers, in NumPy."""
 
 
 class Traced:
@@ -96,13 +119,8 @@ def _applied(equation: Any, given: list[Numbers]) -> list[Numbers]:
     if name in CALLS:
         return _evaluated(parameters["jaxpr"], given)
     if name in MOVES:
-        ends = np.cumsum([0, *(x.size for x in given)])
-        places = [start + np.arange(x.size).reshape(x.shape) for start, x in zip(ends[:-1], given, strict=True)]
-        with jax.ensure_compile_time_eval():
-            moved = equation.primitive.bind(*map(jnp.int32, places), **parameters)
-        moved = map(np.asarray, moved if equation.primitive.multiple_results else [moved])
-        every = np.concatenate([x.ravel() for x in given])
-        return [every[x.ravel()].reshape(x.shape) for x in moved]
+        moved = MOVES[name](*given, **parameters)
+        return moved if equation.primitive.multiple_results else [moved]
     if name in ELEMENTWISE:
         same = [np.broadcast_to(x, shape).ravel() for x in given]
         return [filled([_bound(equation, numbers) for numbers in zip(*same, strict=True)], shape)]

@@ -27,6 +27,10 @@ POINT_SIZE = 3
 """Parameters of a point: x, y, z in scene units."""
 
 
+NONE = np.zeros(0, np.int32)
+"""No index."""
+
+
 class ProblemError(InputError):
     """The input is not a valid bundle adjustment problem. The message is one line for the user."""
 
@@ -90,10 +94,10 @@ class BundleProblem(ArrayRecord):
     def create(
         cls,
         cameras: Any,
-        points: Any,
-        observations: Any,
-        camera_index: Any,
-        point_index: Any,
+        points: Any = None,
+        observations: Any = None,
+        camera_index: Any = NONE,
+        point_index: Any = NONE,
         *,
         covariance: Any = None,
         weight: Any = None,
@@ -106,7 +110,8 @@ class BundleProblem(ArrayRecord):
         Args:
             cameras: shape (cameras, 9), or (cameras, 6 + numbers of the largest camera model).
             points: shape (points, 3).
-            observations: shape (observations, 2), pixels.
+            observations: shape (observations, 2), pixels. Without them and points a problem has cameras alone, and
+                needs other residuals (`jaxba.with_residual`): a pose graph.
             camera_index: shape (observations,), integers in [0, cameras).
             point_index: shape (observations,), integers in [0, points).
             covariance: optional, shape (observations, 2, 2), pixels squared; symmetric and
@@ -119,8 +124,8 @@ class BundleProblem(ArrayRecord):
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
-                are no observations, a covariance is not positive definite, cameras of one lens differ in their
-                intrinsics, or a part of the problem does not fit the others.
+                is an empty array of observations, a covariance is not positive definite, cameras of one lens
+                differ in their intrinsics, or a part of the problem does not fit the others.
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
@@ -130,10 +135,13 @@ class BundleProblem(ArrayRecord):
                 raise ProblemError(f"{name} must be a {kind.__name__}, not of type {type(part).__name__}")
         try:
             cameras = _floats("cameras", cameras, POSE_SIZE + lens_size(lenses))
+            alone = points is None and observations is None
+            if alone:
+                points, observations = np.zeros((0, POINT_SIZE)), np.zeros((0, 2))
             points = _floats("points", points, POINT_SIZE)
             observations = _floats("observations", observations, 2)
             whitening = _whitening(covariance, weight, len(observations))
-            if not len(observations):
+            if not alone and not len(observations):
                 raise ProblemError("the problem has no observations")
             camera_index = indices("camera_index", camera_index, len(cameras), len(observations))
             point_index = indices("point_index", point_index, len(points), len(observations))

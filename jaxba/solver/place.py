@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.lm.records import LMState
-from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constants import Constants
 from jaxba.problem.facing import without_views_of
 from jaxba.problem.frames import in_frames, out_of_frames
@@ -103,10 +103,13 @@ def check_problem(problem: BundleProblem) -> None:
     Raises:
         ValueError: it is no problem.
         TypeError: JAX traces it.
+        ProblemError: it has neither observations nor other residuals.
         RuntimeError: the process was forked from one in which JAX had started.
     """
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
+    if not problem.num_observations and not problem.residuals:
+        raise ProblemError("the problem has no observations")
     refuse_traces(vars(problem))
     process.refuse_fork()
 

@@ -68,12 +68,12 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
     camera, point = [np.asarray(problem.camera_index)], [np.asarray(problem.point_index)]
     observations, points, cameras = problem.num_observations, problem.num_points, problem.num_cameras
     found, groups = [], block_groups(problem)
-    sees = np.zeros(problem.num_points, int)
+    sees = np.zeros(problem.num_points + 1, int)  # the last for no point
     sees[point[0]] = camera[0]
     for rows in residuals.rows:
         owners, pairs = owners_of(problem, rows, groups), -(-rows.size // 2)
         shape = (len(rows), pairs, max(len(owners.cameras), len(owners.points)))
-        own = [np.where(c < 0, sees[np.maximum(p, 0)], c) for c, p in itertools.product(*owners)]
+        own = [np.where(c < 0, sees[p], c) for c, p in itertools.product(*owners)]
         at = [np.where(p < 0, points + np.arange(len(rows)), p) for p in owners.points]
         if len(owners.points) == 2:  # a camera for all numbers
             own = [cameras + np.arange(len(rows))] * 2
