@@ -95,7 +95,7 @@ def python_factor(model: gtsam.noiseModel.Base, measured: gtsam.Pose3, first: in
     """The same factor, of a function in Python with derivatives by hand."""
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None) -> np.ndarray:
-        one, two = (values.atPose3(key) for key in this.keys())
+        one, two = (values.atPose3(key) for key in list(this.keys()))
         found = one.between(two)
         off = measured.between(found)
         if jacobians is not None:
@@ -145,7 +145,7 @@ class PythonCost(pyceres.CostFunction):
         self.set_parameter_block_sizes([6, 6])
         self._measured = gtsam.Pose3(gtsam.Rot3(turn), move)
 
-    def Evaluate(self, parameters: list, residuals: np.ndarray, jacobians: list | None) -> bool:  # noqa: N802
+    def Evaluate(self, parameters: list, residuals: np.ndarray, jacobians: list | None) -> bool:
         """Ceres' interface."""
         one, two = (gtsam.Pose3(gtsam.Rot3.Expmap(x[:3]), x[3:]) for x in parameters)
         found = one.between(two)
