@@ -122,12 +122,8 @@ def machine() -> dict[str, str]:
 
 
 def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> list[Job]:
-    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once.
-
-    Raises:
-        InputError: an unknown solver, one whose type its method does not have, or one whose
-            library is not installed.
-    """
+    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once. Raises
+    InputError: an unknown solver, one whose type its method does not have, or one whose library is not installed."""
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
     parsed = [parse_solver(name) for name in names]
     for solver in parsed:
@@ -146,15 +142,9 @@ def _check_options(solver: SolverName) -> None:
 
 
 def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
-    """Creates the folder, or continues a benchmark in it. Writes the settings.
-
-    Returns:
-        The records that the folder already has, one for each run.
-
-    Raises:
-        ProblemError: the folder has runs with other settings, or results of other problems or policies under the same
-            names. Files are compared by checksum.
-    """
+    """Creates the folder, or continues a benchmark in it. Writes the settings. Returns the records that the folder
+    already has, one for each run. Raises ProblemError: the folder has runs with other settings, or results of other
+    problems or policies under the same names. Files are compared by checksum."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)

@@ -262,11 +262,8 @@ def check_writable(option: str, path: str | None) -> None:
 
 
 def check_folder(option: str, path: str) -> None:
-    """Checks that an output folder can be created or written, before any work is done.
-
-    Raises:
-        UsageError: it is a file or not writable, or it does not exist and its parent is missing or not writable.
-    """
+    """Checks that an output folder can be created or written, before any work is done. Raises UsageError: it is a file
+    or not writable, or it does not exist and its parent is missing or not writable."""
     target = Path(path).absolute()
     if target.exists() and not target.is_dir():
         raise UsageError(f"{option} {path}: is a file, not a folder")

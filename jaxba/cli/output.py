@@ -67,21 +67,14 @@ def check_outputs(
 
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:
-    """Checks that the format of the output can hold the problem's lenses.
-
-    Raises:
-        ProblemError: it cannot; one line.
-    """
+    """Checks that the format of the output can hold the problem's lenses. Raises ProblemError: it cannot; one line."""
     if output and not is_model(output, source) and formats.holds_bal_only(output):
         check_bal_lenses(problem, output)
 
 
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
-    """Writes the solution, and prints what was written and what the file format cannot store.
-
-    Raises:
-        UsageError: the solution cannot be written.
-    """
+    """Writes the solution, and prints what was written and what the file format cannot store. Raises UsageError: the
+    solution cannot be written."""
     model, like = is_model(output, source), _is_like_source(output, source)
     try:
         if like:

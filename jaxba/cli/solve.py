@@ -224,11 +224,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def with_settings(path: str, words: Sequence[str]) -> Arguments:
-    """The arguments of a command line where what it leaves out is as a file of `--settings` says.
-
-    Raises:
-        UsageError: no such file, or it has what is no option, or no value of it; one line that names the file.
-    """
+    """The arguments of a command line where what it leaves out is as a file of `--settings` says. Raises UsageError: no
+    such file, or it has what is no option, or no value of it; one line that names the file."""
     from jaxba import settings
     from jaxba.settings import configurations
 
@@ -246,11 +243,8 @@ def with_settings(path: str, words: Sequence[str]) -> Arguments:
 
 
 def solver_name(args: Arguments) -> SolverName:
-    """The name of the solver in records and tables.
-
-    Raises:
-        UsageError: the name of the policy states another number of point iterations than `--refine-points`.
-    """
+    """The name of the solver in records and tables. Raises UsageError: the name of the policy states another number of
+    point iterations than `--refine-points`."""
     name = replace(parse_policy(args.policy), dtype=args.dtype, method=args.method)
     if args.refine_points is None:
         return name
@@ -261,12 +255,8 @@ def solver_name(args: Arguments) -> SolverName:
 
 
 def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
-    """The policy and the options for the arguments.
-
-    Raises:
-        UsageError: a number out of range, or options that do not go together; the message names the option.
-        InputError: as `make_policy` and `make_method`.
-    """
+    """The policy and the options for the arguments. Raises UsageError: a number out of range, or options that do not go
+    together; the message names the option. Raises InputError: as `make_policy` and `make_method`."""
     try:
         policy, options = adjusted(*solver_name(args).build(), args.repairs, args.min_gain)
         trained = options.step_options(policy).coordinates

@@ -59,11 +59,8 @@ class TolerantStream:
 
 
 def whole_input() -> str:
-    """A path from which standard input can be read, more than once: all that comes through a pipe is kept first.
-
-    Raises:
-        OSError: there is none, or it cannot be kept.
-    """
+    """A path from which standard input can be read, more than once: all that comes through a pipe is kept first. Raises
+    OSError: there is none, or it cannot be kept."""
     if not stat.S_ISREG(os.fstat(0).st_mode):
         with tempfile.TemporaryFile() as copy, open(0, "rb", closefd=False) as given:
             shutil.copyfileobj(given, copy)

@@ -106,11 +106,8 @@ DRAWN = 64
 
 @for_traces
 def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
-    """The random scene of a class with this number, for this key.
-
-    Raises:
-        ValueError: none of `DRAWN` scenes is worth solving.
-    """
+    """The random scene of a class with this number, for this key. Raises ValueError: none of `DRAWN` scenes is worth
+    solving."""
     scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
     rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
     if not len(rows):

@@ -59,12 +59,9 @@ def read_windows(
 
 
 def read_all(given: Sequence[StrPath | BundleProblem], held_out: float = HELD_OUT) -> list[BundleProblem]:
-    """The problems, in memory or files. `held_out` is the share of the cameras that is held out.
-
-    Raises:
-        ProblemError: a problem cannot be read, has whitened observations, other lenses than BAL's or too few cameras;
-            or none is large enough for windows in two places. One line.
-    """
+    """The problems, in memory or files. `held_out` is the share of the cameras that is held out. Raises ProblemError: a
+    problem cannot be read, has whitened observations, other lenses than BAL's or too few cameras; or none is large
+    enough for windows in two places. One line."""
     problems = []
     for number, path in enumerate(given):
         if isinstance(path, BundleProblem):

@@ -65,11 +65,7 @@ def windows(
     """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before, and their frames.
 
     The last one ends with the last camera, so it may start less than `stride` after the one before. A window keeps the
-    points that its cameras see `min_views` times.
-
-    Raises:
-        ProblemError: the size or stride is out of range.
-    """
+    points that its cameras see `min_views` times. Raises ProblemError: the size or stride is out of range."""
     cameras = problem.num_cameras
     if not 2 <= size <= cameras:
         raise ProblemError(f"--window must lie between 2 and the {cameras} key-frames, is {size}")

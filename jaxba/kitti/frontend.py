@@ -69,11 +69,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
     """Tracks over the frames that are linked with the first one, and the positions of these in the sequence.
 
     The images of the tracks are positions among them. A frame that cannot be linked with one of the `reach` frames
-    before it is left out; too many such frames in a row are an error.
-
-    Raises:
-        ProblemError: an image cannot be read, or frames cannot be linked: the message names them.
-    """
+    before it is left out; too many such frames in a row are an error. Raises ProblemError: an image cannot be read, or
+    frames cannot be linked: the message names them."""
     read, calibration = image_reader(sequence), sequence.calibration
     recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
     pixels: list[np.ndarray] = []

@@ -44,11 +44,7 @@ class Sequence:
         return len(self.numbers)
 
     def only(self, numbers: np.ndarray) -> Sequence:
-        """The frames with these numbers.
-
-        Raises:
-            ProblemError: fewer than two are left.
-        """
+        """The frames with these numbers. Raises ProblemError: fewer than two are left."""
         kept = np.flatnonzero(np.isin(self.numbers, numbers))
         if len(kept) < 2:
             raise ProblemError(f"{display_name(self.folder)}: {len(kept)} of its frames have a pose, not 2")

@@ -74,11 +74,8 @@ class Store:
     """The results in the folder of a run. Only one process may write at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Reads the existing results.
-
-        Raises:
-            ProblemError: a file is damaged; the message names the file and the line.
-        """
+        """Reads the existing results. Raises ProblemError: a file is damaged; the message names the file and the
+        line."""
         self.folder = folder
         self.solves = _read(folder / SOLVES, Record)
         self.plays = _read(folder / PLAYS, Play)

@@ -67,11 +67,8 @@ class Run:
     """A solve in progress: the Ceres problem, the clock and the recorded iterations."""
 
     def __init__(self, problem: BundleProblem, callback: Callback | None) -> None:
-        """Builds the Ceres problem.
-
-        Raises:
-            ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
-        """
+        """Builds the Ceres problem. Raises ProblemError: the initial cost is not finite, or the problem has covariances
+        or shared lenses."""
         self.initial_cost = geometry.cost(problem)
         if not np.isfinite(self.initial_cost):
             raise ProblemError(explain_start(problem))
@@ -107,11 +104,8 @@ class Run:
     def record(self, step: StepInfo) -> bool:
         """Records an iteration at the parameters after it, and calls the callback.
 
-        jaxba evaluates the recorded cost; the time of that and of the callback is not counted.
-
-        Returns:
-            Whether the callback asked to stop.
-        """
+        jaxba evaluates the recorded cost; the time of that and of the callback is not counted. Returns whether the
+        callback asked to stop."""
         now = time.perf_counter()
         self.total_s = now - self.started - self.paused
         if step.accepted:

@@ -178,11 +178,8 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def together(work: Callable[[], T]) -> T:
-    """Runs a function in the first process and returns its result in every process; the others wait.
-
-    Raises:
-        MainFailedError: in the other processes, if it raised an error; the first process raises that error itself.
-    """
+    """Runs a function in the first process and returns its result in every process; the others wait. Raises
+    MainFailedError: in the other processes, if it raised an error; the first process raises that error itself."""
     if not jax.distributed.is_initialized() or jax.process_count() == 1:
         return work()
     client: Any = runtime.global_state.client

@@ -138,11 +138,8 @@ def _folder(kind: Kind) -> Path:
 
 
 def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]:
-    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`.
-
-    Raises:
-        SettingsError: it cannot be read, or is no mapping; `name` says which file.
-    """
+    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`. Raises SettingsError: it cannot
+    be read, or is no mapping; `name` says which file."""
     try:
         text = decode(path.read_bytes())
     except UnicodeDecodeError:

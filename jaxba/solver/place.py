@@ -98,14 +98,9 @@ def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NO_CAMERAS) 
 
 
 def check_problem(problem: BundleProblem) -> None:
-    """First of all in every public function of a problem that computes with JAX.
-
-    Raises:
-        ValueError: it is no problem.
-        TypeError: JAX traces it.
-        ProblemError: it has neither observations nor other residuals.
-        RuntimeError: the process was forked from one in which JAX had started.
-    """
+    """First of all in every public function of a problem that computes with JAX. Raises ValueError: it is no problem.
+    Raises TypeError: JAX traces it. Raises ProblemError: it has neither observations nor other residuals. Raises
+    RuntimeError: the process was forked from one in which JAX had started."""
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if not problem.num_observations and not problem.residuals:

@@ -88,12 +88,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, in their order in the file.
-
-    Raises:
-        TrainError: the file is damaged.
-        OSError: it cannot be opened.
-    """
+    """All arrays of an `.npz` file, in their order in the file. Raises TrainError: the file is damaged. Raises OSError:
+    it cannot be opened."""
     with path.open("rb") as stream:
         try:
             with np.load(stream) as file:
@@ -143,11 +139,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
 
 
 def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and metadata of a checkpoint.
-
-    Raises:
-        TrainError: it cannot be read.
-    """
+    """Arrays and metadata of a checkpoint. Raises TrainError: it cannot be read."""
     path = _path(folder, step)
     try:
         arrays = read_arrays(path)

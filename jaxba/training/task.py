@@ -245,11 +245,7 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
 
 
 def read_banks(path: Path) -> list[Split]:
-    """The scenes of a run's folder.
-
-    Raises:
-        TrainError: another version wrote them, or the file is damaged.
-    """
+    """The scenes of a run's folder. Raises TrainError: another version wrote them, or the file is damaged."""
     arrays = _read(path)
     classes = dict.fromkeys(name.partition("/")[0] for name in arrays)
     return [_named_tuple(path, Split, f"{number}/", arrays) for number in classes]

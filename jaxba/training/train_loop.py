@@ -82,10 +82,7 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
 
 def _check_step(env: Environment, step: Step) -> None:
     """Refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast.
-
-    Raises:
-        AssertionError: naming the shapes.
-    """
+    Raises AssertionError: naming the shapes."""
     chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
     chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
 

@@ -142,11 +142,8 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 
 
 def write_recording(recording: Recording, path: StrPath) -> None:
-    """Writes a recording, whole or not at all. Points are float32, relative to their middle.
-
-    Raises:
-        ProblemError: it cannot be written.
-    """
+    """Writes a recording, whole or not at all. Points are float32, relative to their middle. Raises ProblemError: it
+    cannot be written."""
     problem, lenses = recording.problem, recording.problem.lenses
     middle = np.median(recording.points[-1], axis=0)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
@@ -164,11 +161,7 @@ def write_recording(recording: Recording, path: StrPath) -> None:
 
 
 def read_recording(path: StrPath) -> Recording:
-    """Reads a recording.
-
-    Raises:
-        ProblemError: it is not one of `jaxba-solve --record`; one line.
-    """
+    """Reads a recording. Raises ProblemError: it is not one of `jaxba-solve --record`; one line."""
     name = display_name(path)
     try:
         with np.load(path, allow_pickle=False) as file:
