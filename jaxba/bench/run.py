@@ -63,15 +63,8 @@ class Job:
 def run_solver(
     problem: BundleProblem, source: Source, solver: SolverName, repeat: int, settings: RunSettings
 ) -> Record:
-    """Solves one problem once, with a Python callback after each iteration, and so with measured times.
-
-    Args:
-        problem: the problem.
-        source: where it comes from; its name and family go into the record.
-        solver: what solves it.
-        repeat: number of the repeat, from 0, for the record.
-        settings: shared settings.
-    """
+    """Solves one problem once, with a Python callback after each iteration, and so with measured times. The name and
+    family of the source and the number of the repeat, from 0, go into the record."""
     steps: list[IterationRecord] = []
     watch = lambda step: steps.append(step)
     limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances()}
@@ -207,19 +200,9 @@ def execute(
     """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
     A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or runs out of memory
-    on it, is reported and skipped for this problem.
-
-    Args:
-        jobs: all runs.
-        done: records of earlier runs.
-        folder: where the results file is.
-        settings: shared settings.
-        on_error: called for what is skipped.
-        strict: skip problems of which a part would be left out.
-
-    Raises:
-        OSError: a result cannot be written.
-    """
+    on it, is reported and skipped for this problem. `done` are records of earlier runs, and `on_error` is called for
+    what is skipped. With `strict` these are also problems of which a part would be left out. Raises OSError: a result
+    cannot be written."""
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()
     for job in jobs:

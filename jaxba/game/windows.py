@@ -31,18 +31,10 @@ FEWEST_CAMERAS = 4
 def read_windows(
     problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
 ) -> tuple[Scenes, Scenes]:
-    """Windows of problems: those to train on, and held-out ones from other places.
-
-    Args:
-        problems: in memory, or files as `jaxba.read_problem` takes them.
-        kind: largest numbers of cameras and points of a window.
-        count: windows in all, as many of each problem; a fifth is held out.
-        seed: of the choice.
-        dtype: of all numbers.
-
-    Raises:
-        ProblemError: as `read_all`.
-    """
+    """Windows of problems: those to train on, and held-out ones from other places. Problems are in memory, or files as
+    `jaxba.read_problem` takes them. Of `count` windows, as many of each problem, a fifth is held out; `kind` has their
+    largest numbers of cameras and points, `seed` is that of the choice, and `dtype` that of all numbers. Raises
+    ProblemError: as `read_all`."""
     parts: tuple[list, list] = [], []
     for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])
@@ -85,12 +77,7 @@ def places(
     linked: Int[np.ndarray, "cameras cameras"], held_out: float = HELD_OUT
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " held_out"]]:
     """The cameras of training and of held-out windows. In the order of a band matrix neighbours stand together, so that
-    the last of them are another place.
-
-    Args:
-        linked: as `covisible` returns it.
-        held_out: share of the cameras.
-    """
+    the last of them are another place. `linked` is as `covisible` returns it, `held_out` a share of the cameras."""
     order = reverse_cuthill_mckee(coo_array(linked).tocsr(), symmetric_mode=True).astype(np.int64)
     first = len(order) - round(held_out * len(order))
     return order[:first], order[first:]
@@ -116,17 +103,9 @@ def window(
     """One window, its arrays without the axis of scenes.
 
     Cameras join one by one, each time the one that shares most points with those already there; of the points that two
-    of them observe, as many as fit are drawn.
-
-    Args:
-        problem: where it is cut from.
-        kind: largest numbers of cameras and points.
-        linked: as `covisible` returns it.
-        allowed: cameras to choose from.
-        rng: source of random numbers.
-        fewest: cameras of the smallest window, if there are as many.
-        moved: share of the windows that begin where random scenes do.
-    """
+    of them observe, as many as fit are drawn. `kind` has the largest numbers of cameras and points, `linked` is as
+    `covisible` returns it, and `allowed` are cameras to choose from. `fewest` is the number of cameras of the smallest
+    window, if there are as many, and `moved` the share of the windows that begin where random scenes do."""
     most = min(kind.cameras, len(allowed))
     size = int(rng.integers(min(fewest, most), most + 1))
     chosen = [int(rng.choice(allowed))]

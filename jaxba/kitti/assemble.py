@@ -25,19 +25,10 @@ Frames = tuple[int, ...]
 def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build) -> BundleProblem:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
-    Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical
-    pixels are scaled by fx / fy.
-
-    Args:
-        tracks: their images are the views.
-        views: world to camera, looking down +z.
-        calibration: of all views.
-        frames: frame number of each view.
-        options: limits for points.
-
-    Raises:
-        ProblemError: a camera would see fewer than 10 points.
-    """
+    Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical pixels are
+    scaled by fx / fy. The images of the tracks are the views, which are world to camera, looking down +z; `frames` are
+    their numbers, and `options` has the limits for points. Raises ProblemError: a camera would see fewer than 10
+    points."""
     rays = calibration.rays(tracks.pixels)
     observations = Observations(tracks.image, tracks.track, rays)
     error = options.max_error / calibration.fx

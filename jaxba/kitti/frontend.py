@@ -32,17 +32,10 @@ def build(
 ) -> tuple[BundleProblem, Frames, int]:
     """Makes the problem of a sequence: it, its key-frames, and how many tracks they had. Repeatable.
 
-    Notes say which frames could not be matched with the others, or placed by known points.
-
-    Args:
-        sequence: the frames.
-        options: of tracks, key-frames, poses and points.
-        poses_of_frames: camera-to-world poses of frames by their numbers; needed where the initial poses are given.
-        report: called with the progress.
-
-    Raises:
-        ProblemError: an image cannot be read, frames share too little, or the camera does not move.
-    """
+    Notes say which frames could not be matched with the others, or placed by known points. `poses_of_frames` gives
+    camera-to-world poses of frames by their numbers; it is needed where the initial poses are given. `report` is called
+    with the progress. Raises ProblemError: an image cannot be read, frames share too little, or the camera does not
+    move."""
     every, linked = link(sequence, options, report)
     numbers = tuple(sequence.numbers[i] for i in linked)
     chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)

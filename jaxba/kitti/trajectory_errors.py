@@ -49,8 +49,8 @@ def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
 def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
     """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE with a delta of one.
 
-    The estimate must have the truth's scale; its rotation and position do not matter. Returns those of translations, in units
-    of the truth, and of rotations, degrees."""
+    The estimate must have the truth's scale; its rotation and position do not matter. Returns the errors of
+    translations, in units of the truth, and of rotations, degrees."""
     error = _motion(_motion(truth[:-1], truth[1:]), _motion(aligned[:-1], aligned[1:]))
     return _statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error))
 

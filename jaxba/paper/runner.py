@@ -98,16 +98,8 @@ class Runner:
     """A reproduction run in a folder. Nothing is run whose result is in the folder."""
 
     def __init__(self, config: PaperConfig, folder: Path, report: Callable[[str], None] = lambda _: None) -> None:
-        """Reads the results that the folder has.
-
-        Args:
-            config: configuration of the run.
-            folder: folder of all results; must exist.
-            report: called with a line of text when something starts.
-
-        Raises:
-            ProblemError: a file of results is damaged.
-        """
+        """Reads the results that the folder, which must exist, has. `report` is called with a line of text when
+        something starts. Raises ProblemError: a file of results is damaged."""
         self.config, self.folder, self.report = config, folder, report
         self.store = Store(folder)
         self.done = 0

@@ -26,16 +26,9 @@ _SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str
 
 
 def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
-    """An instance of a dataclass; missing keys have their defaults.
-
-    Args:
-        kind: dataclass of numbers, strings, literals, tuples, optional values and further dataclasses.
-        data: mapping by field name.
-        path: of the mapping inside a larger one, for messages.
-
-    Raises:
-        SettingsError: with the key and what it should be.
-    """
+    """An instance of a dataclass of numbers, strings, literals, tuples, optional values and further dataclasses, from a
+    mapping by field name; missing keys have their defaults. `path` is that of the mapping inside a larger one, for
+    messages. Raises SettingsError: with the key and what it should be."""
     if not isinstance(data, Mapping):
         raise SettingsError(f"{path or 'settings'} must be a mapping, is {_show(data)}")
     types_by_name = {key: _type_of(kind, key, _join(path, key)) for key in data}
@@ -69,17 +62,9 @@ def to_yaml(value: Any) -> str:
 
 
 def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
-    """Sets one value inside nested mappings; missing mappings are created.
-
-    Args:
-        data: is modified.
-        path: keys joined by dots.
-        value: plain data.
-        kind: the dataclass that `data` describes.
-
-    Raises:
-        SettingsError: there is no such key, or the path continues below a value.
-    """
+    """Sets one value, plain data, inside the nested mappings `data` of a dataclass; missing mappings are created.
+    `path` has the keys, joined by dots. Raises SettingsError: there is no such key, or the path continues below a
+    value."""
     *above, last = path.split(".")
     for depth, key in enumerate(above, 1):
         kind, inside = _type_of(kind, key, path), ".".join(above[:depth])

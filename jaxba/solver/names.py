@@ -121,15 +121,8 @@ def parse_policy(name: str) -> SolverName:
 
 def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, SolveOptions]:
     """The policy of a name `policy[+refineK|+embedded]`, and the options with the refinement that the name states.
-
-    Args:
-        name: as in a solver's name.
-        options: options of the solve. Coordinates that they give take precedence over those that come with `+embedded`.
-
-    Raises:
-        ValueError: the options have another refinement than the name.
-        InputError: as `make_policy`.
-    """
+    Coordinates that the options give take precedence over those that come with `+embedded`. Raises ValueError: the
+    options have another refinement than the name. Raises InputError: as `make_policy`."""
     policy, _, stated = split_refinement(name)
     if not stated:
         return make_policy(name), options

@@ -84,18 +84,10 @@ class Hooks:
 def prepare_folder(
     folder: Path, config: TrainConfig | None, resume: bool, overrides: tuple[str, ...] = ()
 ) -> TrainConfig:
-    """Creates the folder of a new run, or reads the configuration of the run to resume.
-
-    Args:
-        folder: of the run.
-        config: of a new run; of a resumed one, None for the configuration in its folder.
-        resume: whether a run in the folder is resumed.
-        overrides: `key=value` of a resumed run.
-
-    Raises:
-        TrainError: a new run would overwrite another one, there is no run to resume, or its configuration differs.
-        SettingsError: the configuration in the folder cannot be read.
-    """
+    """Creates the folder of a new run, or reads the configuration of the run to resume. For a resumed run, `config`
+    None is the configuration in its folder, and `overrides` change that by `key=value`. Raises TrainError: a new run
+    would overwrite another one, there is no run to resume, or its configuration differs. Raises SettingsError: the
+    configuration in the folder cannot be read."""
     path = folder / CONFIG
     if path.is_file() and not resume and _others(folder):
         raise TrainError(f"{folder} holds a run already; --resume goes on with it, --out names another folder")

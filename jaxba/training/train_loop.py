@@ -89,14 +89,8 @@ def _check_step(env: Environment, step: Step) -> None:
 
 @functools.partial(jit, static_argnames=("sac", "loop"))
 def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
-    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: a pytree; its arrays are traced.
-        key: of all random numbers; the same key gives bitwise identical results on the same machine.
-    """
+    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions. Arrays of `env`, a pytree,
+    are traced. The same key gives bitwise identical results on the same machine."""
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
     env_state, observation = env.reset(reset_key)
     chex.assert_shape(observation, (env.num_envs, env.observation_size))
@@ -123,21 +117,13 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
 def run_chunk(
     sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
 ) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
-    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: the one of `start`.
-        state: donated; its memory is reused for the result.
-
-    Returns:
-        The state after the chunk, and means over it: those of `sac.update`; `reward` of a step; `action_mean`,
-        `action_std`; `action_spread`, the standard deviation of the mean action over replayed states; `q_bias`, what
-        the critics expected more than what came, entropy included, in episodes that were terminated (NaN if none was);
-        `episodes`, the number of episodes that ended, and `episode/NAME`, the mean of a metric of the
-        environment over them (0 if none ended); `dropped`, transitions with numbers that are not finite.
-    """
+    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates. The state is
+    donated; its memory is reused for the result. Returns the state after the chunk, and means over it: those of
+    `sac.update`; `reward` of a step; `action_mean`, `action_std`; `action_spread`, the standard deviation of the mean
+    action over replayed states; `q_bias`, what the critics expected more than what came, entropy included, in episodes
+    that were terminated (NaN if none was); `episodes`, the number of episodes that ended, and `episode/NAME`, the mean
+    of a metric of the environment over them (0 if none ended); `dropped`, transitions with numbers that are not
+    finite."""
 
     def body(state: LoopState, _: None) -> tuple[LoopState, tuple[Any, ...]]:
         key, act_key, sample_key = jax.random.split(state.key, 3)
@@ -197,14 +183,8 @@ def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
 
 @functools.partial(jit, static_argnames=("sac", "loop"))
 def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
-    """`start` for several agents, which share the environment's scenes; the state has a first axis of agents.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: a pytree.
-        keys: one of each agent.
-    """
+    """`start` for several agents, one for each key, which share the environment's scenes; the state has a first axis of
+    agents."""
     return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
 
 

@@ -42,13 +42,8 @@ class Frusta(NamedTuple):
 
 
 def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | None = None) -> Frusta:
-    """The frusta of all cameras.
-
-    Args:
-        problem: cameras and observations.
-        sizes: width and height of images, pixels; None, or 0 for an image: from the principal point, or where there is
-            none as far as its observations reach.
-    """
+    """The frusta of all cameras. `sizes` are width and height of images, pixels; None, or 0 for an image: from the
+    principal point, or where there is none as far as its observations reach."""
     numbers = np.asarray(problem.cameras)[:, POSE_SIZE:]
     count = len(numbers)
     focal, center, flipped = np.ones((count, 2)), np.zeros((count, 2)), np.zeros(count, bool)

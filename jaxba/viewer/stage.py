@@ -55,17 +55,9 @@ class Stage:
         on_click: Callable[[int], None] | None = None,
         caption: str = "",
     ) -> None:
-        """Draws the last iteration.
-
-        Args:
-            server: owner of the scene.
-            shown: what to draw.
-            key: name in the tree of the scene.
-            place: number among those side by side.
-            points: most points that are drawn.
-            on_click: called with the number of an image whose frustum was clicked.
-            caption: text above the scene, `""`, `"name"`, or `"numbers"` with those of the iteration.
-        """
+        """Draws the last iteration, with at most so many points. `key` is the name in the tree of the scene, `place`
+        the number among those side by side; `on_click` is called with the number of an image whose frustum was clicked.
+        The caption above the scene is `""`, `"name"`, or `"numbers"` with those of the iteration."""
         self.shown, self._server, self._on_click = shown, server, on_click
         self._caption, recording = caption, shown.recording
         self.iteration, self.colour, self.chosen = recording.last, self.colour_choices()[0], None
@@ -223,11 +215,8 @@ class Stage:
             self.layers.label(text, (0.0, 0.0, float(np.percentile(points[:, 2], 95)) + 0.3))
 
     def numbers(self, between: str = ", ") -> str:
-        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error.
-
-        Args:
-            between: what stands between the parts.
-        """
+        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error. `between` stands between
+        the parts."""
         recording, k = self.shown.recording, self.iteration
         error = f"RMSE {self.measures.rmse:.4g} px"
         if recording.last == 0:
