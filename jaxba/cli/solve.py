@@ -21,7 +21,6 @@ from jaxba.cli.options import options, parse
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
-from jaxba.cli.watching import watched
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
@@ -329,7 +328,7 @@ def _solve(args: Arguments) -> int:
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
-    watch, end = watched(problem, path, args.record, args.view)
+    watch, end = view.watched(problem, path, args.record, args.view)
     solution, steps = _iterate(args, problem, policy, options, watch)
     common.print_line(table.summary(problem, solution, options.loss))
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:

@@ -25,7 +25,7 @@ from jaxba.paper.config import PaperConfig
 from jaxba.paper.results import NEAR, SCHEDULE, Play, Row, Store
 from jaxba.peers import require
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import LinearSolverChoice, StepOptions
+from jaxba.problem.options import LinearSolverChoice
 from jaxba.runtime import process
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.names import PEERS, SolverName, parse_solver
@@ -177,8 +177,7 @@ class Runner:
             path.parent.mkdir(parents=True, exist_ok=True)
             zero_net.save(path, net)
             self.done += 1
-        trained = agent.step_options(StepOptions())
-        return net, SolveOptions(refinement=trained.refinement, coordinates=trained.coordinates)
+        return net, SolveOptions()
 
     # Work
 

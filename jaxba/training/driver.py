@@ -55,7 +55,7 @@ class Outcome(NamedTuple):
     """Result of a call of `train`."""
 
     finished: bool  # false if `Hooks.stop` ended it
-    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet, or in another process than the first
+    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet
     state: LoopState  # of all agents, on a leading axis
 
 
@@ -212,9 +212,6 @@ class _Run:
 
     def _save(self) -> None:
         arrays = checkpoint.pack({"state": self.state})
-        self._write(arrays)
-
-    def _write(self, arrays: dict[str, np.ndarray]) -> None:
         if self.best:
             actors = jax.tree.map(lambda *x: jnp.stack(x), *(one.actor for one in self.best))
             arrays = {**checkpoint.pack({"best": actors}), **arrays}

@@ -20,6 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import Labels
+from jaxba.problem.residuals import Residuals
 from jaxba.solver.drivers import IterationRecord
 
 RECORDED_POINTS = 20_000
@@ -86,20 +87,10 @@ def evenly(count: int, limit: int) -> Int[np.ndarray, " kept"]:
 
 def of_points(problem: BundleProblem, kept: Int[np.ndarray, " kept"]) -> BundleProblem:
     """A problem of some of the points and their observations, for looking at: without constants and priors."""
-    number = np.full(problem.num_points, -1)
-    number[kept] = np.arange(len(kept))
-    index = number[np.asarray(problem.point_index)]
-    there = index >= 0
-    labels = problem.labels
-    return BundleProblem(
-        np.asarray(problem.cameras),
-        np.asarray(problem.points)[kept],
-        np.asarray(problem.observations)[there],
-        np.asarray(problem.camera_index)[there],
-        index[there].astype(np.int32),
-        lenses=problem.lenses,
-        labels=labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept]),
-    )
+    labels, none = problem.labels, dict.fromkeys(("whitening", "constants", "rigs"))
+    found = problem.replace(residuals=Residuals(), **none).subset(np.isin(problem.point_index, kept), points=kept)
+    labels = labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept])
+    return found.replace(cameras=np.asarray(problem.cameras), labels=labels)
 
 
 def still(problem: BundleProblem) -> Recording:
