@@ -55,12 +55,10 @@ def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
     return _statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error))
 
 
-def segment_errors(
-    aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS, step: int = DEVKIT_STEP
-) -> SegmentErrors | None:
+def segment_errors(aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS) -> SegmentErrors | None:
     """Errors over segments of the true path, per metre; None if the path is too short for all of them.
 
-    A segment of length L starts at every `step`-th pose and ends at the first one whose distance along the true path
+    A segment of length L starts at every tenth pose and ends at the first one whose distance along the true path
     is larger by more than L.
 
     Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`).
@@ -68,7 +66,7 @@ def segment_errors(
     steps = np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     pairs = []
-    for first in range(0, len(truth), step):
+    for first in range(0, len(truth), DEVKIT_STEP):
         for length in lengths:
             last = int(np.searchsorted(distance, distance[first] + length, side="right"))
             if last < len(truth):

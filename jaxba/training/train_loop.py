@@ -18,12 +18,12 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.game.protocol import Environment, Step
+from jaxba.problem.options import check_count
 from jaxba.runtime.jit import jit
 from jaxba.training import replay as ring
 from jaxba.training import sac as agent
 from jaxba.training.replay import Replay, Transition
 from jaxba.training.sac import Learner, SacConfig
-from jaxba.typing import LARGEST_COUNT
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,7 @@ class LoopConfig:
     def __post_init__(self) -> None:
         """Checks that all counts are positive and fit 32 bits."""
         for name in ("replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-            if getattr(self, name) > LARGEST_COUNT:
-                raise ValueError(f"{name} must be at most {LARGEST_COUNT}, not {getattr(self, name)}")
+            check_count(name, getattr(self, name), 1)
 
 
 class LoopState(NamedTuple):
