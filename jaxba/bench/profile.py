@@ -81,11 +81,6 @@ def cost_targets(tolerance: float) -> tuple[Target, ...]:
     return (*(Target("tau", tau) for tau in taus(tolerance)), *relative)
 
 
-def standard_targets(tolerance: float) -> tuple[Target, ...]:
-    """The targets in tables: those of `cost_targets`, converged."""
-    return (*cost_targets(tolerance), Target("converged"))
-
-
 NEVER = Reached(math.inf, math.inf)
 """The value for a target that is never reached."""
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from jaxba.io.encoding import decode
+from jaxba.io.encoding import plain_text
 from jaxba.io.files import display_name, reason, visible
 from jaxba.typing import InputError
 
@@ -117,7 +117,7 @@ def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]
     """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`. Raises SettingsError: it cannot
     be read, or is no mapping; `name` says which file."""
     try:
-        text = decode(path.read_bytes())
+        text = plain_text(path.read_bytes()).decode()
     except UnicodeDecodeError:
         raise SettingsError(f"{name}: not text") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a null character

@@ -64,7 +64,9 @@ class LoopState(NamedTuple):
 def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions"]) -> tuple[LoopState, Step]:
     """One vector step, stored in the buffer. A truncated episode has discount 1 and its true last observation."""
     env_state, step = env.step(state.env_state, action)
-    _check_step(env, step)
+    # refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast
+    chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
+    chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
     transitions = Transition(
         state.observation, action, step.reward, step.final_observation, 1.0 - jnp.asarray(step.terminated, jnp.float32)
     )
@@ -75,13 +77,6 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
         env_steps=state.env_steps + env.num_envs,
     )
     return after, step
-
-
-def _check_step(env: Environment, step: Step) -> None:
-    """Refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast.
-    Raises AssertionError: naming the shapes."""
-    chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
-    chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
 
 
 @functools.partial(jit, static_argnames=("sac", "loop"))

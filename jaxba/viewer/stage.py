@@ -174,12 +174,6 @@ class Stage:
         np.fill_diagonal(distance, np.inf)
         return float(np.clip(0.5 * np.median(distance.min(axis=1)), 0.015, 0.15))
 
-    def _corners(self, poses: Float[np.ndarray, "n 3 4"], half: Float[np.ndarray, "n 2"]) -> np.ndarray:
-        """Corners of images on the page, shape (n, 4, 3)."""
-        return self._on_page(
-            poses[:, None], _CORNERS * half[:, None], geometry.depth_of_image(half, self._size)[:, None]
-        )
-
     def _on_page(self, poses: np.ndarray, plane: np.ndarray, depth: Any) -> np.ndarray:
         """Places on the page of places in the planes at distance 1 before cameras, at a depth."""
         local = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) * np.asarray(depth)[..., None]
@@ -200,7 +194,9 @@ class Stage:
     def _draw_start(self) -> None:
         start = self.shown.problem
         poses = self._similarity.poses(camera_poses(start.cameras))[self.frusta]
-        corners = self._corners(poses, self.image_planes.half[self.frusta])
+        half = self.image_planes.half[self.frusta]
+        depth = geometry.depth_of_image(half, self._size)
+        corners = self._on_page(poses[:, None], _CORNERS * half[:, None], depth[:, None])  # of images, (n, 4, 3)
         apex = np.broadcast_to(poses[:, None, :, 3], corners.shape)
         around = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
         spokes = np.stack([apex, corners], axis=2)
