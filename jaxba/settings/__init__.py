@@ -14,6 +14,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from jaxba.io.json_lines import plain
 from jaxba.problem.checks import shown
 from jaxba.settings.configurations import SettingsError
 
@@ -45,13 +46,6 @@ def field_types(kind: type) -> dict[str, Any]:
     """Types of the fields of a dataclass by name."""
     hints = typing.get_type_hints(kind)
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-
-
-def plain(value: Any) -> Any:
-    """The inverse of `read`: mappings and lists only."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return [plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def to_yaml(value: Any) -> str:
