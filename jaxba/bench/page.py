@@ -31,13 +31,9 @@ class Page:
     where plotly.js knows tags."""
 
     def __init__(self, title: str, facts: Mapping[str, str], styles: Mapping[str, Style], axes: Sequence[str]) -> None:
-        """
-        Args:
-            title: of the page.
-            facts: machine, versions and the like, on top; the value of `command` is set as code.
-            styles: of what a reader can show and hide, by its name.
-            axes: positions of the switch of the x axis, the first one at the start.
-        """
+        """`facts` are machine, versions and the like, on top; the value of `command` is set as code. `styles` are those
+        of what a reader can show and hide, by its name, and `axes` the positions of the switch of the x axis, the first
+        one at the start."""
         self.title, self.facts, self.styles, self.axes = title, facts, styles, axes
         self._charts: list[Chart] = []
         self._sections: list[str] = []

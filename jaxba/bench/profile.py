@@ -81,11 +81,6 @@ def cost_targets(tolerance: float) -> tuple[Target, ...]:
     return (*(Target("tau", tau) for tau in taus(tolerance)), *relative)
 
 
-def standard_targets(tolerance: float) -> tuple[Target, ...]:
-    """The targets in tables: those of `cost_targets`, converged."""
-    return (*cost_targets(tolerance), Target("converged"))
-
-
 NEVER = Reached(math.inf, math.inf)
 """The value for a target that is never reached."""
 
@@ -192,15 +187,9 @@ step function of alpha. Positions of the steps, ascending from 1, and the value 
 
 
 def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, Curve]:
-    """Performance profile of each solver.
-
-    Args:
-        times: `times[solver][problem]`, time or another positive cost; infinite, NaN or absent means not solved.
-
-    Returns:
-        A curve for each solver. The denominator is the number of problems that have an entry for any solver, solved or
-        not. If the best time of a problem is 0 (solved at the start), only times of 0 count as within any factor.
-    """
+    """Performance profile of each solver. `times[solver][problem]` is a time or another positive cost; infinite, NaN or
+    absent means not solved. The denominator is the number of problems that have an entry for any solver, solved or not.
+    If the best time of a problem is 0 (solved at the start), only times of 0 count as within any factor."""
     names = list(dict.fromkeys(name for row in times.values() for name in row))
     best = {
         name: min((row[name] for row in times.values() if row.get(name, math.nan) >= 0), default=math.inf)

@@ -63,15 +63,8 @@ class Job:
 def run_solver(
     problem: BundleProblem, source: Source, solver: SolverName, repeat: int, settings: RunSettings
 ) -> Record:
-    """Solves one problem once, with a Python callback after each iteration, and so with measured times.
-
-    Args:
-        problem: the problem.
-        source: where it comes from; its name and family go into the record.
-        solver: what solves it.
-        repeat: number of the repeat, from 0, for the record.
-        settings: shared settings.
-    """
+    """Solves one problem once, with a Python callback after each iteration, and so with measured times. The name and
+    family of the source and the number of the repeat, from 0, go into the record."""
     steps: list[IterationRecord] = []
     watch = lambda step: steps.append(step)
     limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances()}
@@ -122,12 +115,8 @@ def machine() -> dict[str, str]:
 
 
 def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> list[Job]:
-    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once.
-
-    Raises:
-        InputError: an unknown solver, one whose type its method does not have, or one whose
-            library is not installed.
-    """
+    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once. Raises
+    InputError: an unknown solver, one whose type its method does not have, or one whose library is not installed."""
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
     parsed = [parse_solver(name) for name in names]
     for solver in parsed:
@@ -146,15 +135,9 @@ def _check_options(solver: SolverName) -> None:
 
 
 def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
-    """Creates the folder, or continues a benchmark in it. Writes the settings.
-
-    Returns:
-        The records that the folder already has, one for each run.
-
-    Raises:
-        ProblemError: the folder has runs with other settings, or results of other problems or policies under the same
-            names. Files are compared by checksum.
-    """
+    """Creates the folder, or continues a benchmark in it. Writes the settings. Returns the records that the folder
+    already has, one for each run. Raises ProblemError: the folder has runs with other settings, or results of other
+    problems or policies under the same names. Files are compared by checksum."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
@@ -217,19 +200,9 @@ def execute(
     """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
     A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or runs out of memory
-    on it, is reported and skipped for this problem.
-
-    Args:
-        jobs: all runs.
-        done: records of earlier runs.
-        folder: where the results file is.
-        settings: shared settings.
-        on_error: called for what is skipped.
-        strict: skip problems of which a part would be left out.
-
-    Raises:
-        OSError: a result cannot be written.
-    """
+    on it, is reported and skipped for this problem. `done` are records of earlier runs, and `on_error` is called for
+    what is skipped. With `strict` these are also problems of which a part would be left out. Raises OSError: a result
+    cannot be written."""
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()
     for job in jobs:

@@ -39,14 +39,8 @@ class Source:
     """Makes the problem, where its location does not say how."""
 
     def read(self, *, strict: bool = False) -> BundleProblem:
-        """Reads or generates the problem.
-
-        Args:
-            strict: as for `read_problem`.
-
-        Raises:
-            ProblemError: the input is invalid; the message is one line.
-        """
+        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: the input is invalid;
+        the message is one line."""
         if self.make is not None:
             return self.make()
         if not self.location.startswith(SCENE_PREFIX):
@@ -62,15 +56,9 @@ def default_sources() -> list[Source]:
 
 
 def sources(locations: list[str]) -> list[Source]:
-    """Checks that problems exist, and gives each a unique name.
-
-    Args:
-        locations: paths, random scenes (`scene:NAME:SEED`), or names of downloaded BAL problems such as ladybug-49, if
-            there is no file of that name. Duplicates count once.
-
-    Raises:
-        ProblemError: a missing file or an unknown scene; the message is one line.
-    """
+    """Checks that problems exist, and gives each a unique name. Locations are paths, random scenes (`scene:NAME:SEED`),
+    or names of downloaded BAL problems such as ladybug-49, if there is no file of that name; duplicates count once.
+    Raises ProblemError: a missing file or an unknown scene; the message is one line."""
     found: list[Source] = []
     for location in locations:
         if location.startswith(SCENE_PREFIX):

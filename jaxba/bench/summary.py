@@ -108,14 +108,9 @@ class Summary:
 
 
 def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapping[str, Any] | None = None) -> Summary:
-    """Computes the statistics of all tables.
-
-    Args:
-        records: any number, also none.
-        tolerance: tau of the target `tau`.
-        metadata: device, threads, versions and the like; copied into the result.
-    """
-    targets = profile.standard_targets(tolerance)
+    """Computes the statistics of all tables, from any number of records, also none. `tolerance` is tau of the target
+    `tau`; device, threads, versions and the like (`metadata`) are copied into the result."""
+    targets = (*profile.cost_targets(tolerance), Target("converged"))
     starts, bests = profile.initial_costs(records), profile.best_cost(records)
     tables = {target.key: profile.reach_table(records, target) for target in targets}
     names, solvers = profile.problem_names(records), profile.solver_names(records)

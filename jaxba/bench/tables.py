@@ -43,12 +43,7 @@ def percentage(fraction: float) -> str:
 
 
 def tables(summary: Summary, details: bool = True) -> list[Table]:
-    """All tables of a summary.
-
-    Args:
-        summary: from `summarize`.
-        details: whether to include the table with a row for each pair of problem and solver.
-    """
+    """All tables of a summary; with `details` also the one with a row for each pair of problem and solver."""
     found = [_overview(summary), *_reach_tables(summary)]
     found += [
         _against(summary, yardstick) for yardstick in YARDSTICKS if any(yardstick in s.against for s in summary.solvers)

@@ -46,15 +46,8 @@ RULE = Style(COLOURS[-1], "8px,6px", "circle")
 def to_html(
     rows: Sequence[Row], rules: Mapping[str, Any], table: Table, episodes: Trajectories, facts: Mapping[str, str]
 ) -> str:
-    """The page.
-
-    Args:
-        rows: of the log.
-        rules: a `Score` by name of the yardstick.
-        table: the comparison on the held-out scenes.
-        episodes: of the best policy; the first `EPISODES` are shown.
-        facts: machine, versions, command.
-    """
+    """The page: from rows of the log, a `Score` by name of the yardstick, the comparison on the held-out scenes,
+    episodes of the best policy, of which the first `EPISODES` are shown, and machine, versions and command."""
     styles = solver_styles([TRAINED, *rules])
     agents = len({row["seed"] for row in rows})
     spread = f"Mean of {agents} agents; shaded: from the lowest to the highest. " if agents > 1 else ""

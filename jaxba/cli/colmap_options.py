@@ -45,11 +45,8 @@ OPTIONS: dict[str, str | dict[str, list[str]]] = {
 
 
 def translated(argv: Sequence[str]) -> list[str]:
-    """A command line with COLMAP's options replaced. All constants are gathered in one `--constant`.
-
-    Raises:
-        UsageError: an option of COLMAP that has no meaning here, or no value; one line.
-    """
+    """A command line with COLMAP's options replaced. All constants are gathered in one `--constant`. Raises UsageError:
+    an option of COLMAP that has no meaning here, or no value; one line."""
     found, paths, constants, words = [], [], [], list(argv)
     while words:
         word = words.pop(0)

@@ -158,11 +158,8 @@ def exit_with(status: int) -> NoReturn:
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK.
-
-    Args:
-        untraced: which cache; see `use_compilation_cache`.
-    """
+    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK. `untraced` says
+    which cache: see `use_compilation_cache`."""
     from jaxba.runtime import process
 
     process.keep_memory()
@@ -171,12 +168,9 @@ def prepare_process(*, untraced: bool = False) -> None:
 
 
 def use_compilation_cache(untraced: bool = False) -> None:
-    """Keeps compiled programs in the user's cache folder, so that the next run starts faster.
-
-    Args:
-        untraced: whether by `runtime/executable_cache.py`, which finds programs without tracing them, but only those
-            that are compiled in parallel. Otherwise by JAX's own cache, which excludes the other.
-    """
+    """Keeps compiled programs in the user's cache folder, so that the next run starts faster: if `untraced` by
+    `runtime/executable_cache.py`, which finds programs without tracing them, but only those that are compiled in
+    parallel; otherwise by JAX's own cache, which excludes the other."""
     import jax
 
     from jaxba.runtime.compilation import use_cache
@@ -230,15 +224,9 @@ def require(fulfilled: bool, message: str) -> None:
 
 
 def check_writable(option: str, path: str | None) -> None:
-    """Checks that an output file can be written, before any work is done.
-
-    Args:
-        option: name of the option, for the message.
-        path: the file; None and the names of streams are accepted.
-
-    Raises:
-        UsageError: the folder is missing or not writable, the file is read-only, or the path is that of a folder.
-    """
+    """Checks that the file of an output option can be written, before any work is done; None and the names of streams
+    are accepted. Raises UsageError: the folder is missing or not writable, the file is read-only, or the path is that
+    of a folder."""
     from jaxba.io.files import STREAMS
 
     if path is None or path.startswith(STREAMS):
@@ -262,11 +250,8 @@ def check_writable(option: str, path: str | None) -> None:
 
 
 def check_folder(option: str, path: str) -> None:
-    """Checks that an output folder can be created or written, before any work is done.
-
-    Raises:
-        UsageError: it is a file or not writable, or it does not exist and its parent is missing or not writable.
-    """
+    """Checks that an output folder can be created or written, before any work is done. Raises UsageError: it is a file
+    or not writable, or it does not exist and its parent is missing or not writable."""
     target = Path(path).absolute()
     if target.exists() and not target.is_dir():
         raise UsageError(f"{option} {path}: is a file, not a folder")
@@ -278,14 +263,8 @@ def check_folder(option: str, path: str) -> None:
 
 def check_positive(**values: Any) -> None:
     """Checks that numbers are positive, that tolerances (names ending in `tol`) are not negative, and that integers are
-    not too large for 32 bits.
-
-    Args:
-        values: values by argument name.
-
-    Raises:
-        UsageError: a value is invalid; the message names the option.
-    """
+    not too large for 32 bits. Values are given by argument name. Raises UsageError: a value is invalid; the message
+    names the option."""
     from jaxba.typing import LARGEST_COUNT
 
     for name, value in values.items():

@@ -20,7 +20,7 @@ from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
 from jaxba.io import check_output, write_problem
 from jaxba.io.files import sidecar_path, strip_compression
 from jaxba.io.formats import FORMATS, by_ending
-from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
+from jaxba.io.frames import poses_of, read_sidecar, write_sidecar
 from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
@@ -224,7 +224,7 @@ def _evaluate(args: EvaluateArguments) -> int:
 
     _check_results_apart(args)
     side = read_sidecar(args.problem)
-    truth = None if args.poses is None else truth_of(side, args.poses)
+    truth = None if args.poses is None else poses_of(read_poses(args.poses), side.frames, side.calibration)
     with common.notes_printed():
         results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
     views = [(_caption(numbers), points, poses[:, :, 3]) for numbers, poses, points in results]

@@ -15,12 +15,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 
 def is_model(output: str, source: str | None) -> bool:
     """Whether the output is written as a COLMAP model: it is a folder, or the problem is a model and the output has no
-    ending of a file (`formats.is_file_name`).
-
-    Args:
-        output: path of the output.
-        source: path of the problem; None for a random scene.
-    """
+    ending of a file (`formats.is_file_name`). `source` is the path of the problem; None for a random scene."""
     if is_folder(output):
         return True
     if source is None or not is_colmap(source) or formats.is_file_name(output):
@@ -36,19 +31,10 @@ def _is_like_source(output: str, source: str | None) -> bool:
 def check_outputs(
     output: str | None, others: Mapping[str, str | None], source: str | None, read: Mapping[str, str | None]
 ) -> None:
-    """Checks that the output files can be written, and that none is another one or a file that is read.
-
-    Only the solution may replace its own problem.
-
-    Args:
-        output: of `--output`.
-        others: the other output files by their options.
-        source: path of the problem.
-        read: other files that are read, by what they are.
-
-    Raises:
-        UsageError, ProblemError: they cannot be, or one is; the message is one line.
-    """
+    """Checks that the output files can be written, and that none is another one or a file that is read; only the
+    solution may replace its own problem. `output` is that of `--output`, `others` are other output files by their
+    options, `source` is the path of the problem, and `read` are other files that are read, by what they are. Raises
+    UsageError, ProblemError: they cannot be, or one is; the message is one line."""
     solution: list[StrPath | None] = [output]
     if output and is_model(output, source):
         solution = [*formats.model_files(output)]
@@ -67,21 +53,14 @@ def check_outputs(
 
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:
-    """Checks that the format of the output can hold the problem's lenses.
-
-    Raises:
-        ProblemError: it cannot; one line.
-    """
+    """Checks that the format of the output can hold the problem's lenses. Raises ProblemError: it cannot; one line."""
     if output and not is_model(output, source) and formats.holds_bal_only(output):
         check_bal_lenses(problem, output)
 
 
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
-    """Writes the solution, and prints what was written and what the file format cannot store.
-
-    Raises:
-        UsageError: the solution cannot be written.
-    """
+    """Writes the solution, and prints what was written and what the file format cannot store. Raises UsageError: the
+    solution cannot be written."""
     model, like = is_model(output, source), _is_like_source(output, source)
     try:
         if like:

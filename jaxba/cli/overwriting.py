@@ -16,15 +16,9 @@ PROBLEM = "a file of the problem"
 
 
 def check_apart(written: Mapping[str, Iterable[StrPath | None]], read: Mapping[str, Iterable[StrPath | None]]) -> None:
-    """Checks that no output is a file that is read, or another output, also by a link or another spelling.
-
-    Args:
-        written: files by the option that names them; None stands for no file.
-        read: files by what they are for messages, such as `the file of --constraints`.
-
-    Raises:
-        UsageError: one is; one line.
-    """
+    """Checks that no output is a file that is read, or another output, also by a link or another spelling. Outputs are
+    given by the option that names them, None for no file; inputs by what they are for messages, such as `the file of
+    --constraints`. Raises UsageError: one is; one line."""
     inputs = {_identity(path): what for what, paths in read.items() for path in paths if path}
     outputs: dict[Hashable, str] = {}
     for option, paths in written.items():

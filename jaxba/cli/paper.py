@@ -88,10 +88,7 @@ def _paper(args: Arguments) -> int:
 
 def _open(folder: Path, config: Any) -> None:
     """Creates the folder and writes the configuration there, or checks that the folder has the same configuration.
-
-    Raises:
-        InputError: the folder has another configuration, or cannot be written.
-    """
+    Raises InputError: the folder has another configuration, or cannot be written."""
     from jaxba import settings
     from jaxba.paper import config as configs
     from jaxba.runtime.atomic import write_text

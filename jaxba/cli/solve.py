@@ -21,7 +21,6 @@ from jaxba.cli.options import options, parse
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
-from jaxba.cli.watching import watched
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
@@ -224,11 +223,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def with_settings(path: str, words: Sequence[str]) -> Arguments:
-    """The arguments of a command line where what it leaves out is as a file of `--settings` says.
-
-    Raises:
-        UsageError: no such file, or it has what is no option, or no value of it; one line that names the file.
-    """
+    """The arguments of a command line where what it leaves out is as a file of `--settings` says. Raises UsageError: no
+    such file, or it has what is no option, or no value of it; one line that names the file."""
     from jaxba import settings
     from jaxba.settings import configurations
 
@@ -246,11 +242,8 @@ def with_settings(path: str, words: Sequence[str]) -> Arguments:
 
 
 def solver_name(args: Arguments) -> SolverName:
-    """The name of the solver in records and tables.
-
-    Raises:
-        UsageError: the name of the policy states another number of point iterations than `--refine-points`.
-    """
+    """The name of the solver in records and tables. Raises UsageError: the name of the policy states another number of
+    point iterations than `--refine-points`."""
     name = replace(parse_policy(args.policy), dtype=args.dtype, method=args.method)
     if args.refine_points is None:
         return name
@@ -261,12 +254,8 @@ def solver_name(args: Arguments) -> SolverName:
 
 
 def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
-    """The policy and the options for the arguments.
-
-    Raises:
-        UsageError: a number out of range, or options that do not go together; the message names the option.
-        InputError: as `make_policy` and `make_method`.
-    """
+    """The policy and the options for the arguments. Raises UsageError: a number out of range, or options that do not go
+    together; the message names the option. Raises InputError: as `make_policy` and `make_method`."""
     try:
         policy, options = adjusted(*solver_name(args).build(), args.repairs, args.min_gain)
         trained = options.step_options(policy).coordinates
@@ -339,7 +328,7 @@ def _solve(args: Arguments) -> int:
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
-    watch, end = watched(problem, path, args.record, args.view)
+    watch, end = view.watched(problem, path, args.record, args.view)
     solution, steps = _iterate(args, problem, policy, options, watch)
     common.print_line(table.summary(problem, solution, options.loss))
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:

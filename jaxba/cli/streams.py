@@ -22,11 +22,8 @@ class TolerantStream:
     """A text stream that, once its reader has closed it, discards what is written."""
 
     def __init__(self, stream: Any, *, discard_all: bool) -> None:
-        """
-        Args:
-            stream: standard output or error.
-            discard_all: whether to do so after any other error, too, instead of raising an `UnwritableStreamError`.
-        """
+        """For standard output or error. `discard_all`: whether to do so after any other error, too, instead of raising
+        an `UnwritableStreamError`."""
         self._stream, self._discard_all = stream, discard_all
 
     def __getattr__(self, name: str) -> Any:
@@ -59,11 +56,8 @@ class TolerantStream:
 
 
 def whole_input() -> str:
-    """A path from which standard input can be read, more than once: all that comes through a pipe is kept first.
-
-    Raises:
-        OSError: there is none, or it cannot be kept.
-    """
+    """A path from which standard input can be read, more than once: all that comes through a pipe is kept first. Raises
+    OSError: there is none, or it cannot be kept."""
     if not stat.S_ISREG(os.fstat(0).st_mode):
         with tempfile.TemporaryFile() as copy, open(0, "rb", closefd=False) as given:
             shutil.copyfileobj(given, copy)

@@ -1,4 +1,4 @@
-"""`jaxba-view`: problems and recorded solves in the browser."""
+"""`jaxba-view`, and `--record` and `--view` of `jaxba-solve`: problems and solves in the browser, also running ones."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import os
 import socket
 import sys
 import threading
+import time
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,8 @@ import tyro
 
 from jaxba.cli import common
 from jaxba.cli.options import options
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.solver.drivers import IterationRecord, Watch
 
 if TYPE_CHECKING:
     from jaxba.viewer.page import Viewer
@@ -24,6 +27,9 @@ VIEWER = "jaxba.viewer.extra"
 
 NAMED = 5
 """Worst images that are printed."""
+
+PAUSE_S = 0.3
+"""Least time between two updates of the page."""
 
 
 @options
@@ -125,3 +131,39 @@ def wait(viewer: Viewer) -> None:
         threading.Event().wait()
     except KeyboardInterrupt:
         viewer.close()
+
+
+def watched(
+    problem: BundleProblem, path: str | None, record: str | None, show: bool
+) -> tuple[Watch | None, Callable[[], None]]:
+    """Opens the page if `show`, for a problem that was read at `path`; `record` is the file of the recording, if one is
+    wanted. Returns `watch` for `jaxba.solve`, and what is to be called after it: it writes the recording, and serves
+    the page until Ctrl-C."""
+    if record is None and not show:
+        return None, lambda: None
+    from jaxba.viewer.recording import Recorder, write_recording
+
+    recorder, drawn, viewer = Recorder(problem, path or ""), 0.0, None
+    if show:
+        from jaxba.viewer.page import Viewer
+        from jaxba.viewer.sources import shown
+
+        viewer = Viewer([shown(recorder.recording(), Path(path).name if path else "random scene")])
+        announce(viewer)
+
+    def watch(step: IterationRecord, now: Callable[[], BundleProblem]) -> None:
+        nonlocal drawn
+        recorder(step, now)
+        if viewer and time.perf_counter() - drawn >= PAUSE_S:
+            viewer.grow(recorder.recording())
+            drawn = time.perf_counter()
+
+    def end() -> None:
+        if record is not None:
+            write_recording(recorder.recording(), record)
+            common.print_line(f"wrote {record}")
+        if viewer:
+            viewer.grow(recorder.recording())
+            wait(viewer)
+
+    return watch, end

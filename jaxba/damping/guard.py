@@ -73,13 +73,7 @@ def action_of(config: AgentConfig, decades: Float[Array, ""]) -> Float[Array, ""
 
 
 def damping_of(config: AgentConfig, guard: GuardState, action: Float[Array, ""]) -> Float[Array, ""]:
-    """The lambda that the guard allows.
-
-    Args:
-        config: range of lambda.
-        guard: state before the iteration.
-        action: in (-1, 1).
-    """
+    """The lambda that the guard, in its state before the iteration, allows for an action in (-1, 1)."""
     dtype = guard.lowest.dtype
     middle, half = _scale(config)
     least = smallest_decades(config.low, dtype)

@@ -20,13 +20,9 @@ arrays of this size stay in a core's cache: 8 scenes of 10 x 40 took no more tim
 def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None) -> T:
     """`jax.vmap(function)` in groups of `GROUP`, one after the other, on a CPU; at once elsewhere.
 
-    Under `jax.vmap` the groups stay as large and there are more of them.
-
-    Args:
-        function: of one scene. It gets `shared` first if that is not None.
-        arguments: with a first axis of scenes.
-        shared: arrays that all scenes share. Under `jax.vmap` the function must not close over others.
-    """
+    Under `jax.vmap` the groups stay as large and there are more of them. `function` is of one scene, and gets `shared`,
+    arrays that all scenes share, first if that is not None. The arguments have a first axis of scenes. Under `jax.vmap`
+    the function must not close over other arrays."""
     if jax.default_backend() != "cpu":
         return _at_once(function, shared, arguments)
 

@@ -210,10 +210,6 @@ def _points(
     return reference, rig.center[reference] + jnp.einsum("nji,nj->ni", rig.rotation[reference], local)
 
 
-def _local(rig: _Rig, world: Array) -> Float[Array, "cameras points 3"]:
-    return jnp.einsum("cij,cpj->cpi", rig.rotation, world - rig.center[:, None])
-
-
 def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 cameras points"]:
     """Pixels of every point in every camera."""
     rotation = jnp.moveaxis(rig.rotation, 0, -1)[..., None]
@@ -223,7 +219,7 @@ def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 came
 
 def _visible(rig: _Rig, world: Float[Array, "points 3"], half: Array) -> Bool[Array, "cameras points"]:
     """In front of the camera, not too close to it, and inside the image."""
-    local = _local(rig, world)
+    local = jnp.einsum("cij,cpj->cpi", rig.rotation, world - rig.center[:, None])
     depth = -local[..., 2]
     inside = jnp.all(jnp.abs(local[..., :2]) <= half * depth[..., None], axis=-1)
     return (depth > 0.3) & inside

@@ -106,11 +106,8 @@ DRAWN = 64
 
 @for_traces
 def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
-    """The random scene of a class with this number, for this key.
-
-    Raises:
-        ValueError: none of `DRAWN` scenes is worth solving.
-    """
+    """The random scene of a class with this number, for this key. Raises ValueError: none of `DRAWN` scenes is worth
+    solving."""
     scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
     rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
     if not len(rows):
@@ -166,20 +163,9 @@ def solve_scenes(
     on_rule: Callable[[str], None] = lambda _: None,
     tolerance: float = 1e-3,
 ) -> tuple[Bank, Bool[np.ndarray, " scenes"]]:
-    """Solves scenes with every rule, and tells which of them are usable.
-
-    Args:
-        kind: class of the scenes.
-        scenes: the scenes.
-        options: of the steps.
-        limit: iterations of an episode, for the scenes' `ProblemInfo`.
-        rules: the portfolio.
-        on_rule: called with the name of a rule when it begins.
-        tolerance: to which the first rule's iterations are counted.
-
-    Raises:
-        InputError: none of the scenes is worth solving.
-    """
+    """Solves scenes with every rule, and tells which of them are usable. `limit` is that of an episode, for the scenes'
+    `ProblemInfo`; `on_rule` is called with the name of a rule of the portfolio when it begins; `tolerance` is the one
+    to which the first rule's iterations are counted. Raises InputError: none of the scenes is worth solving."""
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
     keep = worth_solving(kind, info)
@@ -222,20 +208,11 @@ def make_banks(
     tolerance: float = 1e-3,
     problems: Sequence[StrPath | BundleProblem] = (),
 ) -> list[Split]:
-    """Draws and solves scenes of every class, and splits the usable ones.
-
-    Args:
-        config: classes and numbers of scenes.
-        key: the same key gives the same banks.
-        options: of the portfolio's steps.
-        limit: iterations of an episode.
-        report: called with a line of text when something begins that takes a while.
-        tolerance: of the game; it does not change which scenes are usable.
-        problems: in memory or files, of which windows are cut instead of those that `config` names.
-
-    Raises:
-        InputError: no scene of a class would be left to train on.
-    """
+    """Draws and solves scenes of every class, and splits the usable ones. The same key gives the same banks. `options`
+    are those of the portfolio's steps, `limit` is that of an episode; `report` is called with a line of text when
+    something begins that takes a while. The tolerance of the game does not change which scenes are usable. Windows are
+    cut from `problems`, in memory or files, instead of those that `config` names. Raises InputError: no scene of a
+    class would be left to train on."""
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = _shape(kind)

@@ -27,22 +27,17 @@ HELD_OUT = 0.2
 FEWEST_CAMERAS = 4
 """Cameras of the smallest window."""
 
+MOVED = 0.5
+"""Share of the windows that begin where random scenes do."""
+
 
 def read_windows(
     problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
 ) -> tuple[Scenes, Scenes]:
-    """Windows of problems: those to train on, and held-out ones from other places.
-
-    Args:
-        problems: in memory, or files as `jaxba.read_problem` takes them.
-        kind: largest numbers of cameras and points of a window.
-        count: windows in all, as many of each problem; a fifth is held out.
-        seed: of the choice.
-        dtype: of all numbers.
-
-    Raises:
-        ProblemError: as `read_all`.
-    """
+    """Windows of problems: those to train on, and held-out ones from other places. Problems are in memory, or files as
+    `jaxba.read_problem` takes them. Of `count` windows, as many of each problem, a fifth is held out; `kind` has their
+    largest numbers of cameras and points, `seed` is that of the choice, and `dtype` that of all numbers. Raises
+    ProblemError: as `read_all`."""
     parts: tuple[list, list] = [], []
     for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])
@@ -58,13 +53,9 @@ def read_windows(
     return stack(train), stack(held_out)
 
 
-def read_all(given: Sequence[StrPath | BundleProblem], held_out: float = HELD_OUT) -> list[BundleProblem]:
-    """The problems, in memory or files. `held_out` is the share of the cameras that is held out.
-
-    Raises:
-        ProblemError: a problem cannot be read, has whitened observations, other lenses than BAL's or too few cameras;
-            or none is large enough for windows in two places. One line.
-    """
+def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
+    """The problems, in memory or files. Raises ProblemError: a problem cannot be read, has whitened observations, other
+    lenses than BAL's or too few cameras; or none is large enough for windows in two places. One line."""
     problems = []
     for number, path in enumerate(given):
         if isinstance(path, BundleProblem):
@@ -78,24 +69,19 @@ def read_all(given: Sequence[StrPath | BundleProblem], held_out: float = HELD_OU
         if problem.num_cameras < FEWEST_CAMERAS:
             raise ProblemError(f"{path}: {problem.num_cameras} cameras; a window has {FEWEST_CAMERAS} at least")
         problems.append(problem)
-    least = round(FEWEST_CAMERAS / held_out)
+    least = round(FEWEST_CAMERAS / HELD_OUT)
     if max(problem.num_cameras for problem in problems) < least:
         raise ProblemError(f"no problem has {least} cameras, so that windows in another place can be held out")
     return problems
 
 
 def places(
-    linked: Int[np.ndarray, "cameras cameras"], held_out: float = HELD_OUT
+    linked: Int[np.ndarray, "cameras cameras"],
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " held_out"]]:
     """The cameras of training and of held-out windows. In the order of a band matrix neighbours stand together, so that
-    the last of them are another place.
-
-    Args:
-        linked: as `covisible` returns it.
-        held_out: share of the cameras.
-    """
+    the last of them are another place. `linked` is as `covisible` returns it."""
     order = reverse_cuthill_mckee(coo_array(linked).tocsr(), symmetric_mode=True).astype(np.int64)
-    first = len(order) - round(held_out * len(order))
+    first = len(order) - round(HELD_OUT * len(order))
     return order[:first], order[first:]
 
 
@@ -113,25 +99,14 @@ def window(
     linked: Int[np.ndarray, "cameras cameras"],
     allowed: Int[np.ndarray, " allowed"],
     rng: np.random.Generator,
-    fewest: int = FEWEST_CAMERAS,
-    moved: float = 0.5,
 ) -> Scenes:
     """One window, its arrays without the axis of scenes.
 
     Cameras join one by one, each time the one that shares most points with those already there; of the points that two
-    of them observe, as many as fit are drawn.
-
-    Args:
-        problem: where it is cut from.
-        kind: largest numbers of cameras and points.
-        linked: as `covisible` returns it.
-        allowed: cameras to choose from.
-        rng: source of random numbers.
-        fewest: cameras of the smallest window, if there are as many.
-        moved: share of the windows that begin where random scenes do.
-    """
+    of them observe, as many as fit are drawn. `kind` has the largest numbers of cameras and points, `linked` is as
+    `covisible` returns it, and `allowed` are cameras to choose from."""
     most = min(kind.cameras, len(allowed))
-    size = int(rng.integers(min(fewest, most), most + 1))
+    size = int(rng.integers(min(FEWEST_CAMERAS, most), most + 1))
     chosen = [int(rng.choice(allowed))]
     while len(chosen) < size:
         rest = np.setdiff1d(allowed, chosen)
@@ -143,18 +118,13 @@ def window(
     grid &= (grid.sum(axis=1) >= MIN_VIEWS)[:, None]
     grid &= (grid.sum(axis=0) >= 2)[None]
     cameras, start = np.array(problem.cameras)[chosen], np.array(problem.points)[points]
-    if rng.random() < moved:
+    if rng.random() < MOVED:
         cameras, start = _moved(cameras, start, rng)
-    wide = lambda x, shape: np.zeros(shape, x.dtype)
-    c, p = len(chosen), len(points)
-    whole_cameras = np.repeat(cameras[:1], kind.cameras, axis=0)
-    whole_cameras[:c] = cameras
-    whole_points = wide(start, (kind.points + 1, 3))
-    whole_points[:p] = start
-    whole_grid = wide(grid, (kind.cameras, kind.points + 1))
-    whole_grid[:c, :p] = grid
-    whole_pixels = wide(pixels, (2, kind.cameras, kind.points + 1))
-    whole_pixels[:, :c, :p] = pixels[:, :, points] * grid
+    more, rest = kind.cameras - len(chosen), kind.points + 1 - len(points)  # that are not observed
+    whole_cameras = np.concatenate([cameras, np.repeat(cameras[:1], more, axis=0)])
+    whole_points = np.pad(start, ((0, rest), (0, 0)))
+    whole_grid = np.pad(grid, ((0, more), (0, rest)))
+    whole_pixels = np.pad(pixels[:, :, points] * grid, ((0, 0), (0, more), (0, rest)))
     return Scenes(whole_cameras.T, whole_points.T, whole_pixels.reshape(2, -1), whole_grid.reshape(-1))  # pyright: ignore[reportArgumentType]
 
 

@@ -49,12 +49,6 @@ def plain_text(data: bytes) -> bytes:
     return text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
 
 
-def decode(data: bytes) -> str:
-    """`plain_text` as characters. Raises UnicodeDecodeError: the bytes are neither UTF-8 nor in the encoding of their
-    mark."""
-    return plain_text(data).decode()
-
-
 def parse_json(text: str | bytes) -> Any:
     """The value of a JSON text. Raises ProblemError: a key is there twice in one object, so that one of its values
     would count for nothing. Raises ValueError, RecursionError: as `json.loads`."""

@@ -68,15 +68,9 @@ def visible(folder: StrPath) -> list[Path]:
 
 
 def read_bytes(path: StrPath, decompress: bool = True) -> bytes:
-    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name.
-
-    Args:
-        path: of the file.
-        decompress: not for binary files, which may begin with any number.
-
-    Raises:
-        ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one line.
-    """
+    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name. Binary
+    files may begin with any number, and are not to be decompressed. Raises ProblemError: it cannot be read, is not
+    compressed as its name says, or is damaged; one line."""
     name = display_name(path)
     try:
         with open(path, "rb") as file:

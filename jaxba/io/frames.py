@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.encoding import decode, parse_json
+from jaxba.io.encoding import parse_json, plain_text
 from jaxba.io.files import StrPath, display_name, open_output, reason, sidecar_path
-from jaxba.io.poses import Poses, read_poses
+from jaxba.io.poses import Poses
 from jaxba.problem.bundle_problem import ProblemError
 
 
@@ -82,7 +82,7 @@ def read_sidecar(path: StrPath) -> Sidecar:
     """Reads the sidecar file of a problem. Raises ProblemError: there is none, or `jaxba-kitti` did not write it."""
     side = sidecar_path(path)
     try:
-        contents = parse_json(decode(side.read_bytes()))
+        contents = parse_json(plain_text(side.read_bytes()).decode())
         calibration = Calibration(**{**contents["calibration"], "offset": tuple(contents["calibration"]["offset"])})
         frames = tuple(int(number) for number in contents["frames"])
     except OSError as error:
@@ -90,8 +90,3 @@ def read_sidecar(path: StrPath) -> Sidecar:
     except (ValueError, KeyError, TypeError):
         raise ProblemError(f"{display_name(side)}: is not a sidecar file of jaxba-kitti") from None
     return Sidecar(frames, calibration, contents)
-
-
-def truth_of(side: Sidecar, path: StrPath) -> Float[np.ndarray, "cameras 3 4"]:
-    """True poses of a problem's cameras, from the file of the whole sequence. Raises ProblemError."""
-    return poses_of(read_poses(path), side.frames, side.calibration)

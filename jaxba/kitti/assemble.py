@@ -25,19 +25,10 @@ Frames = tuple[int, ...]
 def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build) -> BundleProblem:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
-    Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical
-    pixels are scaled by fx / fy.
-
-    Args:
-        tracks: their images are the views.
-        views: world to camera, looking down +z.
-        calibration: of all views.
-        frames: frame number of each view.
-        options: limits for points.
-
-    Raises:
-        ProblemError: a camera would see fewer than 10 points.
-    """
+    Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical pixels are
+    scaled by fx / fy. The images of the tracks are the views, which are world to camera, looking down +z; `frames` are
+    their numbers, and `options` has the limits for points. Raises ProblemError: a camera would see fewer than 10
+    points."""
     rays = calibration.rays(tracks.pixels)
     observations = Observations(tracks.image, tracks.track, rays)
     error = options.max_error / calibration.fx
@@ -65,11 +56,7 @@ def windows(
     """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before, and their frames.
 
     The last one ends with the last camera, so it may start less than `stride` after the one before. A window keeps the
-    points that its cameras see `min_views` times.
-
-    Raises:
-        ProblemError: the size or stride is out of range.
-    """
+    points that its cameras see `min_views` times. Raises ProblemError: the size or stride is out of range."""
     cameras = problem.num_cameras
     if not 2 <= size <= cameras:
         raise ProblemError(f"--window must lie between 2 and the {cameras} key-frames, is {size}")

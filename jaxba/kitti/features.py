@@ -24,11 +24,8 @@ MIN_ESSENTIAL = 8
 
 
 def detect(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
-    """At most `count` key-points of a grey image, the strongest first, no two at the same place.
-
-    Returns:
-        Pixels relative to the centre of the first one, x to the right, y down; descriptors, integers as float32.
-    """
+    """At most `count` key-points of a grey image, the strongest first, no two at the same place. Returns pixels
+    relative to the centre of the first one, x to the right, y down; descriptors, integers as float32."""
     detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST)
     found, descriptors = detector.detectAndCompute(image, None)
     if not found:

@@ -32,17 +32,10 @@ def build(
 ) -> tuple[BundleProblem, Frames, int]:
     """Makes the problem of a sequence: it, its key-frames, and how many tracks they had. Repeatable.
 
-    Notes say which frames could not be matched with the others, or placed by known points.
-
-    Args:
-        sequence: the frames.
-        options: of tracks, key-frames, poses and points.
-        poses_of_frames: camera-to-world poses of frames by their numbers; needed where the initial poses are given.
-        report: called with the progress.
-
-    Raises:
-        ProblemError: an image cannot be read, frames share too little, or the camera does not move.
-    """
+    Notes say which frames could not be matched with the others, or placed by known points. `poses_of_frames` gives
+    camera-to-world poses of frames by their numbers; it is needed where the initial poses are given. `report` is called
+    with the progress. Raises ProblemError: an image cannot be read, frames share too little, or the camera does not
+    move."""
     every, linked = link(sequence, options, report)
     numbers = tuple(sequence.numbers[i] for i in linked)
     chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)
@@ -69,11 +62,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
     """Tracks over the frames that are linked with the first one, and the positions of these in the sequence.
 
     The images of the tracks are positions among them. A frame that cannot be linked with one of the `reach` frames
-    before it is left out; too many such frames in a row are an error.
-
-    Raises:
-        ProblemError: an image cannot be read, or frames cannot be linked: the message names them.
-    """
+    before it is left out; too many such frames in a row are an error. Raises ProblemError: an image cannot be read, or
+    frames cannot be linked: the message names them."""
     read, calibration = image_reader(sequence), sequence.calibration
     recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
     pixels: list[np.ndarray] = []

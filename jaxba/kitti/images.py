@@ -27,11 +27,7 @@ def image_reader(sequence: Sequence) -> Reader:
     """A reader of grey images, which must all have the size of the first one.
 
     Images of 16 bits are shifted to the right until the first one fits into 8 bits: cameras of 10 or 12 bits leave the
-    highest bits empty.
-
-    Raises:
-        ProblemError: (when called) an image cannot be read or has another size.
-    """
+    highest bits empty. Raises ProblemError: (when called) an image cannot be read or has another size."""
     first = functools.cache(lambda: _decode(sequence.images[0]))
 
     def read(index: int) -> np.ndarray:

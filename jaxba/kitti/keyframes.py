@@ -44,18 +44,9 @@ def relative_rotation(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray,
 
 
 def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, numbers: tuple[int, ...]) -> list[int]:
-    """Which images are key-frames.
-
-    Args:
-        tracks: over all images.
-        images: how many there are.
-        choice: `auto` (by parallax and by the share of tracks left), `all`, or a number N for every N-th.
-        calibration: of the images.
-        numbers: the frame numbers of the images, for messages.
-
-    Raises:
-        ProblemError: the choice is none of these, the camera does not move, or neighbours share too few tracks.
-    """
+    """Which of so many images are key-frames. The choice is `auto` (by parallax and by the share of tracks left),
+    `all`, or a number N for every N-th; `numbers` are the frame numbers of the images, for messages. Raises
+    ProblemError: the choice is none of these, the camera does not move, or neighbours share too few tracks."""
     if choice != "auto":
         step = 1 if choice == "all" else int(choice) if re.fullmatch(r"[1-9]\d{0,8}", choice) else 0
         if not step:

@@ -148,22 +148,10 @@ def visual_odometry(
     """Poses of all views from tracks alone.
 
     The poses of views before the first pair with parallax (a car that stands still, or only rotates) are found last.
-
-    Args:
-        tracks: their images are the views, 0 to `views` - 1.
-        views: how many.
-        calibration: of all views.
-        options: limits for points.
-        names: frame numbers of the views, for messages.
-        report: called with the number of views whose pose is known.
-
-    Returns:
-        The poses, the first view at the origin; and views whose pose comes from the neighbouring view, for lack of
-        known points.
-
-    Raises:
-        ProblemError: no pair of views has parallax, or a view shares too few tracks with its neighbour.
-    """
+    The images of the tracks are the views, 0 to `views` - 1; `names` are their frame numbers, for messages, and
+    `options` has the limits for points. `report` is called with the number of views whose pose is known. Returns the
+    poses, the first view at the origin, and the views whose pose comes from the neighbouring view, for lack of known
+    points. Raises ProblemError: no pair of views has parallax, or a view shares too few tracks with its neighbour."""
     scene = _Scene(tracks, views, calibration, options)
     first, second, motion = _bootstrap(scene, views, names)
     scene.place(first, np.eye(3), np.zeros(3))

@@ -25,13 +25,9 @@ def plot_top_view(
 ) -> Figure:
     """A panel for each view, all with the same axes, equal along x and z.
 
-    Points far outside the paths are not shown: a few distant ones would shrink the road to a line.
-
-    Args:
-        views: titles, points and paths of the same cameras, for example before and after bundle adjustment, in the
-            frame of the truth or of the first camera: x to the right, z forward.
-        truth: true positions, metres; None if unknown.
-    """
+    Points far outside the paths are not shown: a few distant ones would shrink the road to a line. `views` are titles,
+    points and paths of the same cameras, for example before and after bundle adjustment, in the frame of the truth or
+    of the first camera: x to the right, z forward. `truth` are true positions, metres; None if unknown."""
     paths = np.concatenate([*(path for _, _, path in views), *([] if truth is None else [truth])])[:, [0, 2]]
     low, high = paths.min(axis=0), paths.max(axis=0)
     margin = MARGIN if truth is not None else 0.3 * float((high - low).max())

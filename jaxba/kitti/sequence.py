@@ -44,11 +44,7 @@ class Sequence:
         return len(self.numbers)
 
     def only(self, numbers: np.ndarray) -> Sequence:
-        """The frames with these numbers.
-
-        Raises:
-            ProblemError: fewer than two are left.
-        """
+        """The frames with these numbers. Raises ProblemError: fewer than two are left."""
         kept = np.flatnonzero(np.isin(self.numbers, numbers))
         if len(kept) < 2:
             raise ProblemError(f"{display_name(self.folder)}: {len(kept)} of its frames have a pose, not 2")
@@ -58,17 +54,10 @@ class Sequence:
 
 
 def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibration: StrPath | None = None) -> Sequence:
-    """The frames of a range. No image is opened yet. Hidden files, such as a Mac's `._000000.png`, are no images.
-
-    Args:
-        folder: of the sequence.
-        frames: `first:end` or `first:end:step` by frame number, the end not included, as a Python slice.
-        camera: 0 and 1 are KITTI's grey cameras, 2 and 3 the coloured ones.
-        calibration: file of the camera matrix, if it is not that of the folder.
-
-    Raises:
-        ProblemError: no folder, images or calibration, or a range outside the sequence.
-    """
+    """The frames of a range. No image is opened yet. Hidden files, such as a Mac's `._000000.png`, are no images. The
+    range is `first:end` or `first:end:step` by frame number, the end not included, as a Python slice. Cameras 0 and 1
+    are KITTI's grey ones, 2 and 3 the coloured ones; `calibration` is the file of the camera matrix, if it is not that
+    of the folder. Raises ProblemError: no folder, images or calibration, or a range outside the sequence."""
     root, name = Path(folder), display_name(folder)
     if not root.is_dir():
         raise ProblemError(f"{name}: no such folder")

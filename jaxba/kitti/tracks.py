@@ -82,12 +82,8 @@ def join_matches(
     """Tracks from matches of pairs of images: the connected components of matched key-points.
 
     A component with two key-points of one image cannot be one point. It is split into the chains of matches between
-    images next to each other: these are one to one, so a chain has no two key-points of one image.
-
-    Args:
-        pixels: key-points of every image.
-        matches: of each pair of images (i < j), pairs of key-points, one to one.
-    """
+    images next to each other: these are one to one, so a chain has no two key-points of one image. `pixels` are the
+    key-points of every image; `matches` of a pair of images (i < j) are pairs of key-points, one to one."""
     sizes = [len(points) for points in pixels]
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     image = np.repeat(np.arange(len(pixels)), sizes)

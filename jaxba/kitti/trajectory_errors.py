@@ -49,21 +49,16 @@ def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
 def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
     """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE with a delta of one.
 
-    The estimate must have the truth's scale; its rotation and position do not matter.
-
-    Returns:
-        Of translations, in units of the truth, and of rotations, degrees.
-    """
+    The estimate must have the truth's scale; its rotation and position do not matter. Returns the errors of
+    translations, in units of the truth, and of rotations, degrees."""
     error = _motion(_motion(truth[:-1], truth[1:]), _motion(aligned[:-1], aligned[1:]))
     return _statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error))
 
 
-def segment_errors(
-    aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS, step: int = DEVKIT_STEP
-) -> SegmentErrors | None:
+def segment_errors(aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS) -> SegmentErrors | None:
     """Errors over segments of the true path, per metre; None if the path is too short for all of them.
 
-    A segment of length L starts at every `step`-th pose and ends at the first one whose distance along the true path
+    A segment of length L starts at every tenth pose and ends at the first one whose distance along the true path
     is larger by more than L.
 
     Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`).
@@ -71,7 +66,7 @@ def segment_errors(
     steps = np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     pairs = []
-    for first in range(0, len(truth), step):
+    for first in range(0, len(truth), DEVKIT_STEP):
         for length in lengths:
             last = int(np.searchsorted(distance, distance[first] + length, side="right"))
             if last < len(truth):

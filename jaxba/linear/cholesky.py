@@ -51,11 +51,8 @@ class Panels(NamedTuple):
 
 @jax.custom_jvp
 def lower_cholesky(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """The lower Cholesky factor of matrices of which only the lower triangle is read, also by the derivative.
-
-    Returns:
-        L with `A = L L^T`; non-finite if a matrix is not positive definite.
-    """
+    """The lower Cholesky factor of matrices of which only the lower triangle is read, also by the derivative. Returns L
+    with `A = L L^T`; non-finite if a matrix is not positive definite."""
     return jnp.linalg.cholesky(matrix, symmetrize_input=False)
 
 

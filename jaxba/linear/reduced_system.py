@@ -34,11 +34,8 @@ T = TypeVar("T")
 
 
 def solve_reduced(system: DampedSystem, options: StepOptions) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
-    """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the options name.
-
-    Returns:
-        The step and the number of iterations (0 for a factorisation). The step is non-finite if a factorisation failed.
-    """
+    """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the options name. Returns the
+    step and the number of iterations (0 for a factorisation). The step is non-finite if a factorisation failed."""
     right, mixed = system.cameras.right, options.mixed_precision
     single = system._replace(**to_single({name: getattr(system, name) for name in _IN_SINGLE})) if mixed else system
     if options.linear_solver != "explicit":

@@ -27,11 +27,7 @@ def capacitance_solve(
     blocks: Float[Array, "cameras width width"],
     right: Float[Array, "cameras width"],
 ) -> Float[Array, "cameras width"]:
-    """Solves `(B - W W^T) x = b`.
-
-    Returns:
-        The camera step; non-finite if S is not positive definite.
-    """
+    """Solves `(B - W W^T) x = b`. Returns the camera step; non-finite if S is not positive definite."""
     factor = lower_cholesky(blocks)
     width = factor.shape[-1]
     unit = jnp.broadcast_to(jnp.eye(width, dtype=factor.dtype), factor.shape)

@@ -72,13 +72,8 @@ def method_of(options: StepOptions) -> StepMethod:
 
 
 def check_plain(options: StepOptions, error: type[ValueError] = ValueError, **asked: bool) -> None:
-    """Refuses another method than plain LM for what only plain LM has.
-
-    Args:
-        options: of the step.
-        error: kind of the error.
-        asked: which keys of `PLAIN_ONLY` a problem or a solve has.
-    """
+    """Refuses another method than plain LM for what only plain LM has, by an error of this kind; `asked` says which
+    keys of `PLAIN_ONLY` a problem or a solve has."""
     for what, wanted in asked.items():
         if wanted and options.method:
             raise error(PLAIN_ONLY[what].format(options.solver_name))

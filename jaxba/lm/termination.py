@@ -130,15 +130,8 @@ def _undamped_fraction(step: StepInfo) -> Float[Array, ""]:
 def termination_of(
     step: StepInfo, stuck: Bool[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
 ) -> Int[Array, ""]:
-    """The first stopping rule that applies to a step, as the integer of a `Termination`.
-
-    Args:
-        step: record of the iteration.
-        stuck: whether a rejected step would be repeated unchanged.
-        iteration: iterations so far, this one included.
-        tolerances: convergence tests.
-        max_iterations: limit of iterations.
-    """
+    """The first stopping rule that applies to a step, as the integer of a `Termination`. `stuck`: whether a rejected
+    step would be repeated unchanged. `iteration`: iterations so far, this one included."""
     by_cost = converged_in_cost(step, tolerances.ftol)
     bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
     damping_limited = step.step_norm > MAX_UNDAMPED_RATIO * _undamped_fraction(step) * bound

@@ -53,19 +53,9 @@ def solve_normal(
     rule: ConjugateGradients,
     forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras width"], Float[Array, "3 points"], Int[Array, ""]]:
-    """Solves `(H + D) d = -g` for cameras and points together.
-
-    Args:
-        layout: the problem's observations.
-        linear: residuals and Jacobians.
-        points: factored diagonal blocks and damping of the points.
-        system: damped diagonal blocks of the cameras.
-        rule: tolerance and iteration limit of conjugate gradients.
-        forcing: forcing term of conjugate gradients.
-
-    Returns:
-        The camera step (manifold coordinates), the point step, and the number of iterations.
-    """
+    """Solves `(H + D) d = -g` for cameras and points together. `points` has factored, `system` damped diagonal blocks;
+    `rule` has tolerance and iteration limit of conjugate gradients, `forcing` is their forcing term. Returns the camera
+    step (manifold coordinates), the point step, and the number of iterations."""
     cameras, width = system.gradient.shape
     join = lambda c, p: jnp.concatenate([c.reshape(-1), p.reshape(-1)])
     split = lambda x: (x[: width * cameras].reshape(cameras, width), x[width * cameras :].reshape(3, -1))

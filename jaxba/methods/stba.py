@@ -76,14 +76,8 @@ class StochasticClusters(StepMethod):
 def clustered_step(
     system: DampedSystem, partition: Partition, options: StepOptions, repairs: int
 ) -> Float[Array, "cameras width"]:
-    """The camera step of one STBA iteration, in manifold coordinates.
-
-    Args:
-        system: that of the unsplit problem; its layout has pairs.
-        partition: the partition of this iteration.
-        options: scaling of the damping.
-        repairs: number of Richardson iterations.
-    """
+    """The camera step of one STBA iteration, in manifold coordinates. `system` is that of the unsplit problem, whose
+    layout has pairs; `partition` is that of this iteration, and `repairs` the number of Richardson iterations."""
     layout, linear, points, cameras, damping = system[:5]
     split = eliminate_replicas(layout, linear, damping, partition, options)
     right = split_right_hand_side(layout, linear, cameras, split)
@@ -151,16 +145,9 @@ def split_right_hand_side(
 def solve_clusters(
     system: DampedSystem, right: Float[Array, "cameras width"], partition: Partition
 ) -> Float[Array, "cameras width"]:
-    """Solves the block-diagonal system, one dense factorisation per cluster.
-
-    Args:
-        system: damped camera blocks; of its points only `projected` is used, which couples the cameras of a cluster.
-        right: right-hand side.
-        partition: the clusters.
-
-    Returns:
-        The camera step, in manifold coordinates; non-finite for a cluster whose factorisation failed.
-    """
+    """Solves the block-diagonal system of damped camera blocks, one dense factorisation per cluster; of its points only
+    `projected` is used, which couples the cameras of a cluster. Returns the camera step, in manifold coordinates;
+    non-finite for a cluster whose factorisation failed."""
     matrices = cluster_matrices(system, partition)
     padded = jnp.concatenate([right, jnp.zeros((1, right.shape[1]), right.dtype)])
     rights = take_rows(padded, partition.members).reshape(partition.members.shape[0], -1)

@@ -65,12 +65,8 @@ class Frames(NamedTuple):
 
 
 def frames(cameras: Float[Array, "parameters cameras"], unknowns: Unknowns = BAL_UNKNOWNS) -> Frames:
-    """Rotation matrices and intrinsics, once per camera and evaluation.
-
-    Args:
-        cameras: pose and lens of each camera, and its extrinsics in a rig.
-        unknowns: knows their camera models, and whether they are in rigs.
-    """
+    """Rotation matrices and intrinsics, once per camera and evaluation. `cameras` are pose and lens of each camera, and
+    its extrinsics in a rig; `unknowns` knows their camera models, and whether they are in rigs."""
     lens = cameras[POSE_SIZE : POSE_SIZE + unknowns.lens_size]
     places = tuple(
         jnp.concatenate([rotation_matrix(cameras[k : k + 3]).reshape(9, -1), cameras[k + 3 : k + POSE_SIZE]])

@@ -114,13 +114,8 @@ class ModelledLens:
         return [jnp.where(mask, row, jnp.zeros_like(row)) for row in pixel], jnp.ones_like(radius)
 
     def pixel(self, which: Which, lens: list[Array], x: Array, y: Array, z: Array) -> Pair:
-        """Pixel of a point in the frame of each camera, in BAL's axes.
-
-        Args:
-            which: model of each camera.
-            lens: numbers of the lenses.
-            x, y, z: of the points, scene units.
-        """
+        """Pixel of a point x, y, z (scene units) in the frame of each camera, in BAL's axes. `which` is the model of
+        each camera, and `lens` has the numbers of the lenses."""
         last = self.models[-1]
         pixel = last.project(lens[: len(last)], x, -y, -z)
         for number, model in enumerate(self.models[:-1]):

@@ -149,14 +149,8 @@ def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""],
 
 def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False) -> Linearization:
     """The linear model in the unknowns: columns of what is constant are zero. Its gradient, and so its step, is then
-    zero, too.
-
-    Args:
-        layout: knows what is constant.
-        linear: with all derivatives.
-        intrinsics: `fixed`: all intrinsics are constant.
-        alone: whether cameras are optimised one by one, so that what they share must be constant.
-    """
+    zero, too. `layout` knows what is constant; with `fixed` intrinsics all of these are. `alone`: whether cameras are
+    optimised one by one, so that what they share must be constant."""
     unknowns, zero = layout.unknowns, jnp.zeros_like(linear.residual[0])
     constant = unknowns.constant(intrinsics, alone=alone)
     free = unknowns.free.at_columns(layout.slot_camera)

@@ -69,11 +69,8 @@ def _views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 points
 
 
 def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
-    """`view_terms` summed over the observations of each point, as a function of the points.
-
-    Returns:
-        A function of points, `Terms` and further vectors over slots, which returns a vector over points for each term.
-    """
+    """`view_terms` summed over the observations of each point, as a function of the points. Returns a function of
+    points, `Terms` and further vectors over slots, which returns a vector over points for each term."""
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
         return point_sums_of(layout, terms, _views(layout, frames, points), *slots)

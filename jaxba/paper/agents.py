@@ -105,10 +105,7 @@ def with_state_size(size: int) -> Agent:
 
 def train_config(config: PaperConfig, agent: Agent) -> TrainConfig:
     """Configuration of the training of an agent: all training runs side by side, on the scenes of the paper's game.
-
-    Raises:
-        SettingsError: an override is invalid.
-    """
+    Raises SettingsError: an override is invalid."""
     changes = (*config.agents.overrides, *agent.overrides, f"seeds={config.agents.seeds}", f"seed={config.seed}")
     found = train_configs.load(agent.preset, changes)
     bank = train_configs.load(OURS.preset, changes).bank
@@ -191,11 +188,8 @@ def scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> 
     """Scenes for training, and scenes for the tables, which are used neither for training nor to choose a checkpoint.
 
     The second set is the last part of the shared bank. It is as large as the set by which checkpoints are chosen, the
-    first part of it (`Task.chosen_on`), so that one compiled program serves both.
-
-    Raises:
-        ProblemError: there are too few scenes.
-    """
+    first part of it (`Task.chosen_on`), so that one compiled program serves both. Raises ProblemError: there are too
+    few scenes."""
     split = _shared_scenes(config, OURS, folder, report)
     count = len(split.train.initial_cost)
     kept = len(split.held_out.initial_cost)

@@ -75,13 +75,8 @@ class Statement(NamedTuple):
 
 
 def judge(statements: Iterable[Statement], row: Callable[[str], Row | None], where: str = "") -> tuple[Claim, ...]:
-    """Tests claims on a set of problems.
-
-    Args:
-        statements: the claims.
-        row: gives the row of a method by name, None if it was not run.
-        where: name of the set.
-    """
+    """Tests claims on the set of problems that is called `where`; `row` gives the row of a method by name, None if it
+    was not run."""
     return tuple(
         one.test(one.text.format(where), one.paper, *(row(name) for name in (one.ours, one.base) if name))
         for one in statements
@@ -159,13 +154,8 @@ def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
 
 
 def error_claim(text: str, paper: float, excess: Sequence[float]) -> Claim:
-    """The claim that an error is larger by less than `paper` on every problem.
-
-    Args:
-        text: the claim in words.
-        paper: the paper's difference.
-        excess: by how much ours is larger, for each problem.
-    """
+    """The claim that an error is larger by less than `paper` on every problem; `excess` is by how much ours is larger,
+    for each."""
     if not excess:
         return Claim(text, f"< {paper:g}", "-", "not run")
     within = sum(x < paper for x in excess)

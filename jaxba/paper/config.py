@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from jaxba import settings
+from jaxba.problem.options import check_count
 from jaxba.settings import SettingsError, configurations
 
 CONFIG = "config.yaml"
@@ -142,8 +143,7 @@ class PaperConfig:
         if not self.agents.length > 0:
             raise ValueError(f"agents.length must be positive, not {self.agents.length}")
         for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, not {value}")
+            check_count(name, value, 1)
         if PAPER_STATE not in self.agents.state_sizes:
             raise ValueError(f"agents.state_sizes must have {PAPER_STATE}, the paper's own, among them")
         if len(set(self.agents.state_sizes)) < len(self.agents.state_sizes):

@@ -66,11 +66,7 @@ def bal(config: RealConfig) -> Problems:
 
 def training_files(config: RealConfig, source: Source) -> tuple[str, tuple[str, ...]]:
     """What an agent may be trained on that is judged on a problem: the other families of BAL, or the other files of
-    KITTI.
-
-    Returns:
-        Name of what is left out, and the paths of the rest; none for a problem of neither data set.
-    """
+    KITTI. Returns the name of what is left out, and the paths of the rest; none for a problem of neither data set."""
     if source.family == config.kitti.name:
         files = _files(config.kitti)
         return label(source.location), tuple(path for path in files if path != source.location)

@@ -29,19 +29,9 @@ say, and what is done here. Beside this module."""
 
 
 def write(runner: Runner, path: Path, command: str) -> list[Path]:
-    """Writes the report, its table of claims, and the page of the figures if anything of them was run.
-
-    Args:
-        runner: the run, with its settings and results.
-        path: the Markdown file; the page stands beside it, with the ending `.html`.
-        command: command line that made the report.
-
-    Returns:
-        All files written.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
+    """Writes the report, its table of claims, and the page of the figures if anything of them was run. The page stands
+    beside the Markdown file, with the ending `.html`; `command` is the command line that made the report. Returns all
+    files written. Raises OSError: a file cannot be written."""
     sections = [entry.section(runner) for entry in TABLES_AND_FIGURES.values()]
     claims = _claims(runner, [claim for _, own in sections for claim in own], command)
     rest = [

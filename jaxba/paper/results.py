@@ -74,11 +74,8 @@ class Store:
     """The results in the folder of a run. Only one process may write at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Reads the existing results.
-
-        Raises:
-            ProblemError: a file is damaged; the message names the file and the line.
-        """
+        """Reads the existing results. Raises ProblemError: a file is damaged; the message names the file and the
+        line."""
         self.folder = folder
         self.solves = _read(folder / SOLVES, Record)
         self.plays = _read(folder / PLAYS, Play)
@@ -142,13 +139,8 @@ class Row(NamedTuple):
 
 
 def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:
-    """The row of a method.
-
-    Args:
-        method: name.
-        outcomes: by training run, the outcomes on the same problems; a rule has one entry.
-        trained: whether the method has training runs.
-    """
+    """The row of a method, from the outcomes on the same problems by training run; a rule has one entry, and none is
+    `trained`."""
     every = [outcome for solves in outcomes.values() for outcome in solves]
     if not every:
         return Row(method, *[math.nan] * 6, seeds=0, solves=0)
@@ -174,12 +166,8 @@ def of_play(play: Play) -> list[Outcome]:
 
 
 def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Outcome]:
-    """The outcomes on problems, with the median time of repeats.
-
-    Args:
-        records: of one method.
-        best: best known cost of each problem.
-    """
+    """The outcomes of one method on problems, with the median time of repeats. `best` has the best known cost of each
+    problem."""
     found = []
     for name, runs in profile.by_problem(records).items():
         first = runs[0]
@@ -200,12 +188,7 @@ SCHEDULE = 4
 
 
 def average_schedule(series: Sequence[Sequence[float]], length: int = SCHEDULE) -> tuple[float, ...]:
-    """The constant schedule of the paper: arithmetic means of the first lambdas of several solves.
-
-    Args:
-        series: lambdas of each solve, in order, at least one in all. A solve that ended earlier does not enter the
-            later means.
-        length: number of values; the result is shorter if all solves are.
-    """
+    """The constant schedule of the paper: arithmetic means of the first lambdas of several solves, in order, at least
+    one in all. A solve that ended earlier does not enter the later means; if all did, there are fewer than `length`."""
     columns = [[row[k] for row in series if len(row) > k] for k in range(length)]
     return tuple(sum(column) / len(column) for column in columns if column)

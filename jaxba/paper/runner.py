@@ -25,7 +25,7 @@ from jaxba.paper.config import PaperConfig
 from jaxba.paper.results import NEAR, SCHEDULE, Play, Row, Store
 from jaxba.peers import require
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import LinearSolverChoice, StepOptions
+from jaxba.problem.options import LinearSolverChoice
 from jaxba.runtime import process
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.names import PEERS, SolverName, parse_solver
@@ -98,16 +98,8 @@ class Runner:
     """A reproduction run in a folder. Nothing is run whose result is in the folder."""
 
     def __init__(self, config: PaperConfig, folder: Path, report: Callable[[str], None] = lambda _: None) -> None:
-        """Reads the results that the folder has.
-
-        Args:
-            config: configuration of the run.
-            folder: folder of all results; must exist.
-            report: called with a line of text when something starts.
-
-        Raises:
-            ProblemError: a file of results is damaged.
-        """
+        """Reads the results that the folder, which must exist, has. `report` is called with a line of text when
+        something starts. Raises ProblemError: a file of results is damaged."""
         self.config, self.folder, self.report = config, folder, report
         self.store = Store(folder)
         self.done = 0
@@ -185,8 +177,7 @@ class Runner:
             path.parent.mkdir(parents=True, exist_ok=True)
             zero_net.save(path, net)
             self.done += 1
-        trained = agent.step_options(StepOptions())
-        return net, SolveOptions(refinement=trained.refinement, coordinates=trained.coordinates)
+        return net, SolveOptions()
 
     # Work
 

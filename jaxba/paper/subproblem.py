@@ -16,16 +16,8 @@ from jaxba.problem.preprocess import MIN_TRACK
 def sub_problem(
     problem: BundleProblem, cameras: Sequence[int] | Int[np.ndarray, " kept"], points: Sequence[int] | None = None
 ) -> BundleProblem:
-    """The problem restricted to some cameras and to the points that at least two of them observe, in the same order.
-
-    Args:
-        problem: the complete problem.
-        cameras: indices of the cameras to keep.
-        points: indices of the points to choose from; all if None.
-
-    Raises:
-        ProblemError: an index is out of range, or no point is left.
-    """
+    """The problem restricted to some cameras and to those points, of the given ones or of all, that at least two of
+    them observe, in the same order. Raises ProblemError: an index is out of range, or no point is left."""
     kept = np.unique(np.asarray(cameras, int))
     allowed = np.arange(problem.num_points) if points is None else np.unique(np.asarray(points, int))
     for name, numbers, count in (("camera", kept, problem.num_cameras), ("point", allowed, problem.num_points)):
@@ -47,18 +39,8 @@ def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, 
     """Cameras with many common points, chosen greedily.
 
     The first is the camera that observes most points. The next is always the one that shares most points with those
-    already chosen; of equals, the one with the lowest index.
-
-    Args:
-        problem: the problem.
-        count: how many cameras.
-
-    Returns:
-        Sorted indices.
-
-    Raises:
-        ProblemError: the problem has fewer cameras.
-    """
+    already chosen; of equals, the one with the lowest index. Returns sorted indices. Raises ProblemError: the problem
+    has fewer cameras."""
     if not 1 <= count <= problem.num_cameras:
         raise ProblemError(f"cannot take {count} of {problem.num_cameras} cameras")
     pairs = np.asarray(problem.camera_index), np.asarray(problem.point_index)

@@ -24,10 +24,9 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.features import Memory, StepFeatures, begin, record
+from jaxba.damping.features import Memory, StepFeatures
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import Layer
-from jaxba.damping.policy import ProblemInfo
+from jaxba.damping.learned import AgentPolicy, Layer
 from jaxba.game.env import Episode, Game
 from jaxba.game.groups import step_groups
 from jaxba.game.scene_bank import Bank
@@ -47,7 +46,7 @@ _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields
 
 @register_pytree
 @dataclass(frozen=True)
-class ZeroNet:
+class ZeroNet(AgentPolicy):
     """A damping policy: a ReLU network from the last states, actions and rewards to one action."""
 
     layers: tuple[Layer, ...]
@@ -56,11 +55,6 @@ class ZeroNet:
     config: AgentConfig = field(metadata={"static": True})
     """Length of the history and range of lambda; must have the observation `paper` and no guard."""
 
-    @property
-    def min_gain(self) -> float:
-        """Gain ratio that a step must exceed."""
-        return self.config.min_gain
-
     def act(self, memory: Memory) -> Float[Array, ""]:
         """The action in (-1, 1)."""
         x = inputs(memory)
@@ -68,14 +62,7 @@ class ZeroNet:
             x = jax.nn.relu(x @ layer.kernel + layer.bias)
         return jnp.tanh(x @ self.layers[-1].kernel + self.layers[-1].bias)[0]
 
-    def init(self, info: ProblemInfo) -> tuple[Memory, Float[Array, ""]]:
-        """See `DampingPolicy`."""
-        memory = begin(self.config, info)
-        return memory, damping_of(self.config, memory.guard, self.act(memory))
-
-    def propose(self, state: Memory, step: StepInfo) -> tuple[Memory, Float[Array, ""]]:
-        """See `DampingPolicy`."""
-        memory = record(self.config, state, step)
+    def _choose(self, memory: Memory) -> tuple[Memory, Float[Array, ""]]:
         return memory, damping_of(self.config, memory.guard, self.act(memory))
 
 

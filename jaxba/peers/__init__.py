@@ -13,11 +13,8 @@ NEEDS = {"pyceres": ("ceres", ("pyceres", "pycolmap"))}
 
 
 def require(solver: SolverName) -> None:
-    """Checks that the library of a solver is installed.
-
-    Raises:
-        InputError: it is not; the message names the package to install.
-    """
+    """Checks that the library of a solver is installed. Raises InputError: it is not; the message names the package to
+    install."""
     if not solver.peer:
         return
     extra, packages = NEEDS[solver.peer.partition(":")[0]]

@@ -67,11 +67,8 @@ class Run:
     """A solve in progress: the Ceres problem, the clock and the recorded iterations."""
 
     def __init__(self, problem: BundleProblem, callback: Callback | None) -> None:
-        """Builds the Ceres problem.
-
-        Raises:
-            ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
-        """
+        """Builds the Ceres problem. Raises ProblemError: the initial cost is not finite, or the problem has covariances
+        or shared lenses."""
         self.initial_cost = geometry.cost(problem)
         if not np.isfinite(self.initial_cost):
             raise ProblemError(explain_start(problem))
@@ -107,11 +104,8 @@ class Run:
     def record(self, step: StepInfo) -> bool:
         """Records an iteration at the parameters after it, and calls the callback.
 
-        jaxba evaluates the recorded cost; the time of that and of the callback is not counted.
-
-        Returns:
-            Whether the callback asked to stop.
-        """
+        jaxba evaluates the recorded cost; the time of that and of the callback is not counted. Returns whether the
+        callback asked to stop."""
         now = time.perf_counter()
         self.total_s = now - self.started - self.paused
         if step.accepted:
@@ -230,19 +224,10 @@ def solve_by_ceres(
     counts as one.
 
     In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead of angles).
-    `parameter_norm` and `damping_fraction` are NaN.
-
-    Args:
-        problem: start of the optimisation.
-        mode: a key of `LINEAR_SOLVERS`, followed by `INNER` for Ceres' inner iterations.
-        max_iterations: limit of linear solves.
-        tolerances: convergence tests; the target cost is ignored, since Ceres has no such test.
-        threads: number of threads of Ceres.
-        callback: called after every iteration; a true return value stops the solve.
-
-    Raises:
-        ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
-    """
+    `parameter_norm` and `damping_fraction` are NaN. `mode` is a key of `LINEAR_SOLVERS`, followed by `INNER` for Ceres'
+    inner iterations. The target cost is ignored, since Ceres has no such test. `callback` is called after every
+    iteration; a true return value stops the solve. Raises ProblemError: the initial cost is not finite, or the problem
+    has covariances or shared lenses."""
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
     options = solver_options(mode, threads)

@@ -109,25 +109,12 @@ def drive_ceres(
 
     The policy gets the same record of a step as from `lm_step`, from jaxba's acceptance test, which counts points
     behind their camera. The gradient is Ceres': by the three tangent coordinates of a quaternion it is twice the one by
-    angles.
-
-    Args:
-        problem: start of the optimisation.
-        mode: a key of `LINEAR_SOLVERS`.
-        policy: chooses lambda; its `min_gain` is the gain ratio that a step must exceed.
-        max_iterations: limit of linear solves.
-        tolerances: convergence tests.
-        threads: number of threads of Ceres.
-        callback: called after every iteration; a true return value stops the solve.
-        embedded: embedded iterations with which jaxba refines each step, if any. Options of the linear solver are
-            ignored, and the policy cannot change the number of point iterations.
-
-    Returns:
-        The solution. `total_s` has the time of Ceres, of the policy and of the acceptance test, without compilation.
-
-    Raises:
-        ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
-    """
+    angles. `mode` is a key of `LINEAR_SOLVERS`; the policy's `min_gain` is the gain ratio that a step must exceed.
+    `callback` is called after every iteration; a true return value stops the solve. By the embedded iterations of
+    `embedded`, if any, jaxba refines each step: options of the linear solver are ignored, and the policy cannot change
+    the number of point iterations. `Solution.total_s` has the time of Ceres, of the policy and of the acceptance test,
+    without compilation. Raises ProblemError: the initial cost is not finite, or the problem has covariances or shared
+    lenses."""
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
     colmap, recorder, accept_any = run.colmap, _SummaryRecorder(), _AcceptAnyStep()

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -57,9 +58,7 @@ class Rigs(ArrayRecord):
 
     def of(self, cameras: Int[np.ndarray, " kept"]) -> Rigs:
         """The same for a subset of the cameras; the numbering of frames is unchanged."""
-        free = None if self.free is None else np.asarray(self.free)[cameras]
-        frame, rotation, translation = (np.asarray(x)[cameras] for x in (self.frame, self.rotation, self.translation))
-        return Rigs(frame, rotation, translation, free)
+        return jax.tree.map(lambda x: np.asarray(x)[cameras], self)
 
     @property
     def turned(self) -> Bool[np.ndarray, " cameras"]:

@@ -24,11 +24,8 @@ DAMPINGS = (1e-6, 1e-2)
 def refine_cameras(
     layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], options: StepOptions
 ) -> Float[Array, "parameters cameras"]:
-    """One damped Gauss-Newton step of every camera on its own, accepted if that camera's own cost falls.
-
-    Returns:
-        New cameras; the total cost is never larger than before.
-    """
+    """One damped Gauss-Newton step of every camera on its own, accepted if that camera's own cost falls. Returns new
+    cameras; the total cost is never larger than before."""
     linear = linearize(layout, cameras, points, options.loss)
     linear = only_free(layout, linear, options.intrinsics, alone=True)
     rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]

@@ -111,14 +111,9 @@ def has_repairs(options: StepOptions) -> bool:
 def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
     """The search whose next candidate is the full step.
 
-    What it adds are NumPy's arrays: outside of a program each conversion by JAX is a program.
-
-    Args:
-        cameras: current cameras [9, cameras]. Arrays, or their shapes and types.
-        points: current points [3, points].
-        cost: their cost, pixels^2.
-        step: solution of the damped system.
-    """
+    What it adds are NumPy's arrays: outside of a program each conversion by JAX is a program. Cameras [9, cameras] and
+    points [3, points] are the current ones: arrays, or their shapes and types. `cost` is theirs, pixels^2, and `step`
+    the solution of the damped system."""
     constant = lambda value, dtype: cast(Array, np.full(cost.shape, value, dtype))
     one, infinite = constant(1, cost.dtype), constant(np.inf, cost.dtype)
     yes, no = constant(1, bool), constant(0, bool)
@@ -147,13 +142,8 @@ def _is_full_step(search: Search) -> Bool[Array, ""]:
 
 
 def next_search(against: Comparison, search: Search, refined: Float[Array, "parameters cameras"]) -> Search:
-    """Evaluates a candidate or a camera round, and decides what comes after it.
-
-    Args:
-        against: data of the step.
-        search: what to evaluate.
-        refined: the cameras after a camera round of `search.candidate`, where `search.refining`; else any.
-    """
+    """Evaluates a candidate or a camera round, and decides what comes after it. `refined` are the cameras after a
+    camera round of `search.candidate`, where `search.refining`; else any."""
     candidate = _assess_next(against, search, refined)
     rounds = jnp.where(search.refining, search.rounds + 1, 0)
     full_step = _is_full_step(search)

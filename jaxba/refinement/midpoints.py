@@ -33,13 +33,8 @@ FEW_UNDISTORTIONS = 3
 
 
 def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDISTORTIONS) -> Float[Array, "3 points"]:
-    """The midpoint of the rays of every point. With parallel rays it is anywhere along them, or non-finite.
-
-    Args:
-        layout: the problem's observations.
-        frames: camera of every slot (`linearize.slot_frames`).
-        undistortions: iterations that remove the distortion.
-    """
+    """The midpoint of the rays of every point. With parallel rays it is anywhere along them, or non-finite. `frames`
+    has the camera of every slot (`linearize.slot_frames`); so many iterations remove the distortion."""
     zeros = jnp.zeros((3, layout.num_points), frames.lens[0].dtype)
     sums = point_passes(layout, frames)(zeros, functools.partial(_ray_terms, undistortions))
 

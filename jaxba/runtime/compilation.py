@@ -123,13 +123,8 @@ def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def program(function: Callable[..., Any], *static: str, level: Level = "full") -> Program:
-    """The program of a function: one and the same for equal arguments.
-
-    Args:
-        function: what it computes.
-        static: names of its static arguments.
-        level: how much it is optimised; full where XLA does not know the options of a lower level.
-    """
+    """The program of a function: one and the same for equal arguments. `static` names the function's static arguments;
+    the level is full where XLA does not know the options of a lower one."""
     return Program(function, static, level)
 
 
@@ -171,15 +166,8 @@ class ParallelCompilation:
         return self
 
     def __call__(self, function: Program, *arguments: Any) -> Any:
-        """Starts to compile a program for such arguments.
-
-        Args:
-            function: what `program` returned.
-            arguments: arrays, or their shapes and types, and static arguments.
-
-        Returns:
-            Shapes and types of its results, to be arguments of the next.
-        """
+        """Starts to compile a program for arguments that are arrays, or their shapes and types, and static ones.
+        Returns shapes and types of its results, to be arguments of the next."""
         if function not in self._results:
             self._results[function] = self._begin(function, *arguments)
         return self._results[function]
@@ -268,11 +256,7 @@ def traced_once(*static: str) -> Callable[[Function], Function]:
     """Decorates a function that a program contains several times: it is traced once for arguments of equal types.
 
     XLA inlines the calls, so that the program is the same; without it two fifths of the time to trace a step went into
-    tracing the same functions again.
-
-    Args:
-        static: names of its static arguments.
-    """
+    tracing the same functions again. `static` names its static arguments."""
     return lambda function: cast(Function, jit(function, static_argnames=static))
 
 

@@ -55,17 +55,10 @@ class MainFailedError(Exception):
 def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
     """Connects this process with the others, before any computation with JAX. On CPUs they talk by gloo.
 
-    Where not all have started after `START_S` the process ends with one line.
-
-    Args:
-        coordinator: `HOST:PORT` of the first process, on a port that is free there.
-        processes: how many there are.
-        process: number of this one, from 0. Without all three JAX finds them under Slurm, Open MPI and Kubernetes.
-
-    Raises:
-        InputError: bad arguments, none were found, or the first process cannot use its port.
-        RuntimeError: JAX has computed already.
-    """
+    Where not all have started after `START_S` the process ends with one line. The coordinator is `HOST:PORT` of the
+    first process, on a port that is free there; processes have numbers from 0. Without all three JAX finds them under
+    Slurm, Open MPI and Kubernetes. Raises InputError: bad arguments, none were found, or the first process cannot use
+    its port. Raises RuntimeError: JAX has computed already."""
     given = [x is not None for x in (coordinator, processes, process)]
     if any(given) and not all(given):
         raise InputError("coordinator, number of processes and number of this process must be given together")
@@ -134,14 +127,9 @@ def has_lost_process(error: BaseException) -> bool:
 def use_devices(count: int | None) -> list[jax.Device]:
     """The first devices of every process, in the order of the processes.
 
-    A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked for.
-
-    Args:
-        count: in each process. None: one, or all that there are if there are several processes.
-
-    Raises:
-        InputError: a process has fewer.
-    """
+    A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked for. `count` is
+    that of each process; None: one, or all that there are if there are several processes. Raises InputError: a process
+    has fewer."""
     if count is not None:
         count = int(count)
         if count < 1:
@@ -178,11 +166,8 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def together(work: Callable[[], T]) -> T:
-    """Runs a function in the first process and returns its result in every process; the others wait.
-
-    Raises:
-        MainFailedError: in the other processes, if it raised an error; the first process raises that error itself.
-    """
+    """Runs a function in the first process and returns its result in every process; the others wait. Raises
+    MainFailedError: in the other processes, if it raised an error; the first process raises that error itself."""
     if not jax.distributed.is_initialized() or jax.process_count() == 1:
         return work()
     client: Any = runtime.global_state.client

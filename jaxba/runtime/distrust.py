@@ -37,11 +37,7 @@ def programs_folder(parent: Path) -> Path:
 
     The first command on a machine tries whether XLA distrusts its own programs, says so, and notes it in a file there.
     Then this and all later commands set XLA's flag, for which JAX's backend must not have started; for the first one it
-    comes too late.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    comes too late. Raises OSError: the folder cannot be written."""
     cpus = Path("/proc/cpuinfo")
     lines = cpus.read_text().splitlines() if cpus.is_file() else []
     features = sorted({line for line in lines if line.startswith(("flags", "Features"))}) or [platform.node()]

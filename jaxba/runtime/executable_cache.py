@@ -59,27 +59,18 @@ class ExecutableCache:
     """Programs in a folder. Like JAX's cache it holds native code: use a folder that nobody else writes to."""
 
     def __init__(self, folder: Path) -> None:
-        """Args:
-        folder: where they are; that it can be written is not needed.
-        """
+        """For programs in a folder; that it can be written is not needed."""
         self.folder = folder
         self._source = _source()  # read now: the files may be edited while the process goes on
 
     def path_for(
         self, function: Callable[..., Any], static: dict[str, Any], arguments: tuple[Any, ...], options: Any = None
     ) -> Path | None:
-        """The file of a program, whether it exists or not.
-
-        Args:
-            function: of this package; what it computes follows from its arguments and the source.
-            static: its static arguments, by name.
-            arguments: the others, in their order: pytrees of arrays, or of shapes and types.
-            options: XLA's, for this program.
-
-        Returns:
-            A path; None where the key would not determine the program: where a function or class from outside this
-            package is part of it, a user's own damping rule for instance.
-        """
+        """The file of a program, whether it exists or not. What a function of this package computes follows from its
+        arguments and the source; `static` are its static arguments by name, `arguments` the others in their order,
+        pytrees of arrays or of shapes and types, and `options` are XLA's for this program. None where the key would not
+        determine the program: where a function or class from outside this package is part of it, a user's own damping
+        rule for instance."""
         try:
             leaves, tree = jax.tree.flatten(arguments)
             key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]

@@ -49,10 +49,7 @@ class jit:
     """
 
     def __init__(self, function: Callable[..., Any], **settings: Any) -> None:
-        """Args:
-        function: what it computes.
-        settings: of `jax.jit`.
-        """
+        """`function` is what it computes, `settings` are those of `jax.jit`."""
         functools.update_wrapper(self, function)
         self._part = jax.jit(function, **settings)
         self._settings = settings

@@ -63,13 +63,8 @@ def run_if(needed: Any, function: Callable[..., Carry], arguments: tuple[Any, ..
 
 def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[AnyArray, ""] | None = None) -> Any:
     """`jax.lax.map`, never taken for a small loop: the results for the entries of a leading axis, one after the other.
-
-    Args:
-        function: of one entry.
-        rows: a pytree of arrays with a common leading axis, at least one entry long.
-        used: number of entries to which the function is applied, the others giving zero; None for all. With a number
-            there are no reverse derivatives.
-    """
+    `function` is of one entry, `rows` a pytree of arrays with a common leading axis, at least one entry long. It is
+    applied to `used` entries, the others giving zero; None: to all. With a number there are no reverse derivatives."""
     count = jax.tree.leaves(rows)[0].shape[0]
     at = lambda k: jax.tree.map(lambda all_: lax.dynamic_index_in_dim(all_, k, keepdims=False), rows)
     if used is None:  # a scan, for reverse differentiation

@@ -25,15 +25,9 @@ TRACED = (
 @contextmanager
 def numerics(dtype: Any, *, single_blas: bool = True) -> Iterator[None]:
     """A context in which programs of the package are traced, compiled and run, with JAX's and NumPy's default settings.
-
-    Args:
-        dtype: of the parameters; 64 bits are on unless it is float32.
-        single_blas: whether LAPACK uses one thread.
-
-    Raises:
-        RuntimeError: the process was forked from one in which JAX had started.
-        TypeError: a function that `jax.jit` traces calls this.
-    """
+    64 bits are on unless `dtype`, that of the parameters, is float32; `single_blas`: whether LAPACK uses one thread.
+    Raises RuntimeError: the process was forked from one in which JAX had started. Raises TypeError: a function that
+    `jax.jit` traces calls this."""
     refuse_fork()
     with ExitStack() as settings:
         settings.enter_context(jax.enable_x64(np.dtype(dtype) != np.float32))

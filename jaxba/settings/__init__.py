@@ -14,6 +14,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from jaxba.io.json_lines import plain
 from jaxba.problem.checks import shown
 from jaxba.settings.configurations import SettingsError
 
@@ -26,16 +27,9 @@ _SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str
 
 
 def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
-    """An instance of a dataclass; missing keys have their defaults.
-
-    Args:
-        kind: dataclass of numbers, strings, literals, tuples, optional values and further dataclasses.
-        data: mapping by field name.
-        path: of the mapping inside a larger one, for messages.
-
-    Raises:
-        SettingsError: with the key and what it should be.
-    """
+    """An instance of a dataclass of numbers, strings, literals, tuples, optional values and further dataclasses, from a
+    mapping by field name; missing keys have their defaults. `path` is that of the mapping inside a larger one, for
+    messages. Raises SettingsError: with the key and what it should be."""
     if not isinstance(data, Mapping):
         raise SettingsError(f"{path or 'settings'} must be a mapping, is {_show(data)}")
     types_by_name = {key: _type_of(kind, key, _join(path, key)) for key in data}
@@ -54,13 +48,6 @@ def field_types(kind: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
-def plain(value: Any) -> Any:
-    """The inverse of `read`: mappings and lists only."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return [plain(item) for item in value] if isinstance(value, tuple) else value
-
-
 def to_yaml(value: Any) -> str:
     """The text of a YAML file with all settings, defaults included."""
     import yaml
@@ -69,17 +56,9 @@ def to_yaml(value: Any) -> str:
 
 
 def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
-    """Sets one value inside nested mappings; missing mappings are created.
-
-    Args:
-        data: is modified.
-        path: keys joined by dots.
-        value: plain data.
-        kind: the dataclass that `data` describes.
-
-    Raises:
-        SettingsError: there is no such key, or the path continues below a value.
-    """
+    """Sets one value, plain data, inside the nested mappings `data` of a dataclass; missing mappings are created.
+    `path` has the keys, joined by dots. Raises SettingsError: there is no such key, or the path continues below a
+    value."""
     *above, last = path.split(".")
     for depth, key in enumerate(above, 1):
         kind, inside = _type_of(kind, key, path), ".".join(above[:depth])

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from jaxba.io.encoding import decode
+from jaxba.io.encoding import plain_text
 from jaxba.io.files import display_name, reason, visible
 from jaxba.typing import InputError
 
@@ -34,16 +34,8 @@ def names(kind: Kind) -> list[str]:
 
 
 def find(kind: Kind, name: str, folder: Path = Path()) -> Path:
-    """Where a configuration lies.
-
-    Args:
-        kind: of the configuration.
-        name: one of `names`, or the path of a file: anything with a slash or an ending.
-        folder: what a path is relative to.
-
-    Raises:
-        SettingsError: there is no such name. Whether the file of a path exists is not looked at.
-    """
+    """Where a configuration lies: one of `names`, or the path of a file, relative to `folder`: anything with a slash or
+    an ending. Raises SettingsError: there is no such name. Whether the file of a path exists is not looked at."""
     if len(Path(name).parts) != 1 or Path(name).suffix:
         return folder / name
     if name not in names(kind):
@@ -53,18 +45,9 @@ def find(kind: Kind, name: str, folder: Path = Path()) -> Path:
 
 
 def read(kind: Kind, name: str) -> dict[str, Any]:
-    """What a configuration says, its bases included; an empty file says nothing.
-
-    Args:
-        kind: of the configuration.
-        name: one of `names`, or the path of a file.
-
-    Returns:
-        Plain data, a new object with each call.
-
-    Raises:
-        SettingsError: no such configuration or base, no YAML, no mapping, or files that extend each other in a circle.
-    """
+    """What a configuration (one of `names`, or the path of a file) says, its bases included; an empty file says
+    nothing. It is plain data, a new object with each call. Raises SettingsError: no such configuration or base, no
+    YAML, no mapping, or files that extend each other in a circle."""
     path = find(kind, name)
     data = read_file(path, name)
     shown, visited, layers = [name], [path.resolve()], [data]
@@ -89,16 +72,9 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
 
 
 def parse(text: str, name: str, *, as_text: bool = False) -> Any:
-    """Plain data from YAML.
-
-    Args:
-        text: to read.
-        name: whose text it is, for messages.
-        as_text: whether all scalars stay the text that they are, as names must: `000010`, `1_000`, `yes`, `null`.
-
-    Raises:
-        SettingsError: not YAML, or a mapping has a key twice.
-    """
+    """Plain data from YAML; `name` says whose text it is, for messages. With `as_text` all scalars stay the text that
+    they are, as names must: `000010`, `1_000`, `yes`, `null`. Raises SettingsError: not YAML, or a mapping has a key
+    twice."""
     import yaml
 
     where = lambda mark: f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
@@ -138,13 +114,10 @@ def _folder(kind: Kind) -> Path:
 
 
 def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]:
-    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`.
-
-    Raises:
-        SettingsError: it cannot be read, or is no mapping; `name` says which file.
-    """
+    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`. Raises SettingsError: it cannot
+    be read, or is no mapping; `name` says which file."""
     try:
-        text = decode(path.read_bytes())
+        text = plain_text(path.read_bytes()).decode()
     except UnicodeDecodeError:
         raise SettingsError(f"{name}: not text") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a null character

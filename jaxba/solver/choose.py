@@ -87,19 +87,10 @@ def choose_linear_solver(
     observations: ObservationOrder | None = None,
     devices: int = 1,
 ) -> StepOptions:
-    """The step options with the requested linear solver.
-
-    Args:
-        problem: determines the choice of `auto`.
-        options: options of the step.
-        asked: `auto` or a name. Methods have their own solver.
-        observations: the sorted observations of the problem, if they are known already.
-        devices: among which observations are divided.
-
-    Raises:
-        ProblemError: a method is asked for that does not support the problem; or a step needs more memory than the
-            device or the machine has.
-    """
+    """The step options with the linear solver that is asked for, `auto` or a name; methods have their own.
+    `observations` are the sorted ones of the problem, if they are known already, and `devices` is the number among
+    which they are divided. Raises ProblemError: a method is asked for that does not support the problem; or a step
+    needs more memory than the device or the machine has."""
     _check_device_memory(len(problem.observations), devices)
     lenses, rigs = problem.lenses, problem.rigs
     if options.method:
@@ -143,13 +134,9 @@ def seconds(amounts: Work) -> float:
 def work(
     problem: BundleProblem, products: float = ASSUMED_PRODUCTS, observations: ObservationOrder | None = None
 ) -> dict[str, Work]:
-    """Work of one iteration with each linear solver that needs at most `MAX_BYTES`.
-
-    Args:
-        problem: determines the numbers of cameras, observations, pairs and co-visible blocks.
-        products: number of products of conjugate gradients in a step.
-        observations: the sorted observations of the problem, if they are known already.
-    """
+    """Work of one iteration with each linear solver that needs at most `MAX_BYTES`. `products` is the number of
+    products of conjugate gradients in a step; `observations` are the sorted ones of the problem, if they are known
+    already."""
     order, width = observations or ObservationOrder.of(problem), _width(problem)
     counts, observed = count_pairs(order), len(order.order)
     every = {"step": 1.0, "observation": observed}
@@ -184,14 +171,9 @@ def _most_pairs(observations: ObservationOrder) -> PairCounts:
 
 
 def _factoring(observations: ObservationOrder, counts: PairCounts, width: int, rigs: bool) -> tuple[Work, float]:
-    """Work of forming and factoring the system, and the memory that it needs, bytes.
-
-    Args:
-        observations: sorted observations of the problem.
-        counts: pairs and blocks.
-        width: unknowns of a camera.
-        rigs: whether cameras move together, so that the system is dense.
-    """
+    """Work of forming and factoring the system, and the memory that it needs, bytes. `counts` are those of pairs and
+    blocks, `width` is the number of unknowns of a camera. In `rigs` cameras move together, so that the system is
+    dense."""
     unknowns, band = float(width * observations.num_cameras), float(width * counts.bandwidth)
     points, cameras = observations.num_observed_points, observations.num_cameras
     if is_dense(observations, cameras, points + 1):

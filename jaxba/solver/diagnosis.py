@@ -25,12 +25,7 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     """A one-line message that names the observation for which the initial cost is not finite.
 
     Costs and depths are those of the step's own model in the same arithmetic, so that the message cannot contradict it.
-
-    Args:
-        problem: at which the cost is not finite.
-        loss: of the solve; None: squared residuals.
-        dtype: type of the solve's parameters.
-    """
+    `loss` is that of the solve (None: squared residuals), `dtype` the type of its parameters."""
     dtype = np.dtype(dtype)
     loss = loss or Loss()
     with numerics(dtype):

@@ -18,12 +18,8 @@ COST, DAMPING, REJECTED = COLOURS[1], COLOURS[2], COLOURS[-1]
 
 
 def plot_history(history: StepInfo, initial_cost: float) -> Figure:
-    """Cost above and lambda below, over the iterations, on logarithmic axes; steps that were rejected are grey.
-
-    Args:
-        history: of a solution, NumPy arrays.
-        initial_cost: before the first iteration, pixels^2.
-    """
+    """Cost above and lambda below, over the iterations, on logarithmic axes; steps that were rejected are grey. The
+    history is that of a solution, NumPy arrays; the initial cost is pixels^2."""
     from matplotlib.figure import Figure  # late: its import takes 0.3 s
 
     figure = Figure(figsize=(6.4, 5.2), layout="constrained")

@@ -72,18 +72,9 @@ def advance(
     max_iterations: Any,
     partitions: Any = 1,
 ) -> Carry:
-    """The carry after a step: the policy's update, and the stopping rules.
-
-    Args:
-        carry: before the step.
-        state: after it; it is passed on unseen, and may be None.
-        step: record of the iteration.
-        policy: the damping policy.
-        tolerances: convergence tests.
-        max_iterations: limit of iterations.
-        partitions: number of random partitions (`layout.num_partitions`); with several, a step from the same state and
-            lambda differs from the one before.
-    """
+    """The carry after a step: the policy's update, and the stopping rules. The state after the step is passed on
+    unseen, and may be None. With several random partitions (`layout.num_partitions`) a step from the same state and
+    lambda differs from the one before."""
     iteration = carry.iteration + 1
     after, damping = policy.propose(carry.policy, step)
     # same policy state and lambda after a rejection: the same step would be rejected forever

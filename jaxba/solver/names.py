@@ -84,11 +84,8 @@ class SolverName:
 def adjusted(
     policy: Any, options: SolveOptions, repairs: Repairs | None, min_gain: float | None
 ) -> tuple[DampingPolicy, SolveOptions]:
-    """What `SolverName.build` returns, with other repairs and another smallest gain ratio. None: as they are.
-
-    Raises:
-        ValueError: `min_gain` is not in [0, 1).
-    """
+    """What `SolverName.build` returns, with other repairs and another smallest gain ratio. None: as they are. Raises
+    ValueError: `min_gain` is not in [0, 1)."""
     if repairs is not None:
         points = 0 if options.refinement is None else options.refinement.points
         whole = replace(EMBEDDED, points=points)
@@ -104,12 +101,9 @@ def adjusted(
 
 
 def split_refinement(name: str) -> tuple[str, int | None, bool]:
-    """The name of a policy without `+refineK` or `+embedded` at its end.
-
-    Returns:
-        The rest of the name; the number of embedded point iterations, None for the full refinement, as in
-        `SolverName.refine_points`; and whether the name says it. What it does not say is 0.
-    """
+    """The name of a policy without `+refineK` or `+embedded` at its end. Returns the rest of the name; the number of
+    embedded point iterations, None for the full refinement, as in `SolverName.refine_points`; and whether the name says
+    it. What it does not say is 0."""
     match = _REFINEMENT.fullmatch(name)
     if match is None:
         return name, 0, False
@@ -127,15 +121,8 @@ def parse_policy(name: str) -> SolverName:
 
 def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, SolveOptions]:
     """The policy of a name `policy[+refineK|+embedded]`, and the options with the refinement that the name states.
-
-    Args:
-        name: as in a solver's name.
-        options: options of the solve. Coordinates that they give take precedence over those that come with `+embedded`.
-
-    Raises:
-        ValueError: the options have another refinement than the name.
-        InputError: as `make_policy`.
-    """
+    Coordinates that the options give take precedence over those that come with `+embedded`. Raises ValueError: the
+    options have another refinement than the name. Raises InputError: as `make_policy`."""
     policy, _, stated = split_refinement(name)
     if not stated:
         return make_policy(name), options

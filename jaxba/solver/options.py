@@ -146,11 +146,8 @@ class SolveOptions:
 
 
 def checked_options(options: SolveOptions | None) -> SolveOptions:
-    """The options, or the defaults for None.
-
-    Raises:
-        ValueError: they are something else, such as the name of a policy.
-    """
+    """The options, or the defaults for None. Raises ValueError: they are something else, such as the name of a
+    policy."""
     if options is None:
         return SolveOptions()
     if not isinstance(options, SolveOptions):

@@ -42,14 +42,8 @@ class Placed(NamedTuple):
     def after(
         self, layout: Layout, order: Int[AnyArray, " points"], state: LMState, options: StepOptions
     ) -> BundleProblem:
-        """The counted problem with the parameters of a state; what was not optimised is copied exactly.
-
-        Args:
-            layout: of `here`, or of a shard of it.
-            order: the point of the problem at each position of `state.points`.
-            state: parameters in layout order.
-            options: whether intrinsics were fixed.
-        """
+        """The counted problem with the parameters of a state; what was not optimised is copied exactly. `layout` is
+        that of `here`, or of a shard of it; `order` has the point of the problem at each position of `state.points`."""
         far = self.offset.any()
         problem = shift(self.counted, -self.offset) if far else self.counted
         points = np.array(problem.points, np.float64)
@@ -86,26 +80,16 @@ class Placed(NamedTuple):
 
 
 def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NO_CAMERAS) -> Placed:
-    """Places a problem.
-
-    Args:
-        problem: any problem.
-        away: cameras whose views are left out.
-    """
+    """Places a problem, without the views of the cameras `away`."""
     counted = without_views_of(problem, away)
     offset = far_middle(counted)
     return Placed(counted, offset, laid_out(in_frames(shift(counted, -offset))))
 
 
 def check_problem(problem: BundleProblem) -> None:
-    """First of all in every public function of a problem that computes with JAX.
-
-    Raises:
-        ValueError: it is no problem.
-        TypeError: JAX traces it.
-        ProblemError: it has neither observations nor other residuals.
-        RuntimeError: the process was forked from one in which JAX had started.
-    """
+    """First of all in every public function of a problem that computes with JAX. Raises ValueError: it is no problem.
+    Raises TypeError: JAX traces it. Raises ProblemError: it has neither observations nor other residuals. Raises
+    RuntimeError: the process was forked from one in which JAX had started."""
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if not problem.num_observations and not problem.residuals:

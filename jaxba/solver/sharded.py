@@ -64,17 +64,9 @@ class Shards:
     def __init__(
         self, problem: BundleProblem, options: StepOptions, devices: Sequence[jax.Device], dtype: np.dtype[Any]
     ) -> None:
-        """Deals the points, builds the layouts of this process, and places them on its devices.
-
-        Args:
-            problem: `in_frames` if it has rigs.
-            options: of the step.
-            devices: of all processes.
-            dtype: of the parameters.
-
-        Raises:
-            ProblemError: the method of the options works on one device only, or there are too few points.
-        """
+        """Deals the points, builds the layouts of this process, and places them on its devices. The problem is
+        `in_frames` if it has rigs; the devices are those of all processes. Raises ProblemError: the method of the
+        options works on one device only, or there are too few points."""
         check_plain(options, ProblemError, devices=True)
         self._options, self._devices = options, devices
         self._mesh = Mesh(np.array(devices), (AXIS,))
@@ -209,13 +201,8 @@ def shard_of(problem: BundleProblem, points: Int[np.ndarray, " kept"]) -> Bundle
 def sharded_layout(
     shards: list[BundleProblem], options: StepOptions, merge: Callable[[list[dict]], list[dict]] = lambda found: found
 ) -> list[Layout]:
-    """The layouts of shards, of equal shapes.
-
-    Args:
-        shards: of one problem, `in_frames` if it has rigs.
-        options: of the step.
-        merge: from what was found here to what was found in all processes.
-    """
+    """The layouts of shards of one problem, `in_frames` if it has rigs, of equal shapes. `merge` gives what was found
+    in all processes for what was found here."""
     known: dict[str, Any] = {}
     for _ in range(MAX_ROUNDS):
         agreements = [Agreement(known) for _ in shards]

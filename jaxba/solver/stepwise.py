@@ -50,11 +50,8 @@ class Stepwise(Driver):
     """Iterations one at a time on one device, of programs at their own levels."""
 
     def __init__(self, first: Mapping[str, int], *arguments: Any) -> None:
-        """
-        Args:
-            first: runs of each part of a step before it is fully optimised (`quick_runs_of`).
-            arguments: as for `Driver`.
-        """
+        """`first` are runs of each part of a step before it is fully optimised (`quick_runs_of`); other arguments as
+        for `Driver`."""
         super().__init__(*arguments)
         self._first, self._runs = first, Counter[str]()
         self._earlier, self._quick = Counter[str](), dict[str, Program]()  # runs of earlier processes, quick programs
@@ -200,12 +197,8 @@ def try_step_by_parts(
 ) -> tuple[LMState, StepInfo]:
     """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
-    Camera rounds are not compiled before they are run.
-
-    Args:
-        call: runs or compiles a program.
-        part: the program of a part of the step, at its present level.
-    """
+    Camera rounds are not compiled before they are run. `part` gives the program of a part of the step, at its present
+    level."""
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:

@@ -34,16 +34,9 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
     """Agglomerative clustering of a graph.
 
     In every round each group picks the group with the largest weight between them, divided by the product of their
-    sizes, and mutual picks are merged. Groups without common edges are merged arbitrarily at the end.
-
-    Args:
-        shared: symmetric edge weights without a diagonal, [nodes, nodes].
-        nodes: number of nodes.
-        clusters: largest number of groups.
-
-    Returns:
-        Label of each node, numbered from 0.
-    """
+    sizes, and mutual picks are merged. Groups without common edges are merged arbitrarily at the end. `shared` are
+    symmetric edge weights without a diagonal, [nodes, nodes], and `clusters` is the largest number of groups. Returns
+    the label of each node, numbered from 0."""
     label, size, weight = np.arange(nodes), np.ones(nodes), shared
     while (groups := len(size)) > clusters:
         degree, column = np.diff(weight.indptr), weight.indices

@@ -58,14 +58,8 @@ def cluster_layout(
 ) -> ClusterLayout:
     """Clusters the cameras and lists the pairs of clusters with common points.
 
-    Clusters are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`.
-
-    Args:
-        observations: the sorted observations of the problem.
-        slots: their slots.
-        lenses: cameras that share a lens.
-        agreement: with the other shards of a problem, which have the same clusters.
-    """
+    Clusters are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`. The other shards of a problem
+    (`agreement`) have the same clusters."""
     from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
 
     camera, point, cameras = observations.camera, observations.point, observations.num_cameras

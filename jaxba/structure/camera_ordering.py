@@ -93,14 +93,9 @@ def is_banded(cameras: int, width: int) -> bool:
 def band_of(
     keys: Int[np.ndarray, " blocks"], rank: Int[np.ndarray, " cameras"], width: int, tile: int = TILE_CAMERAS
 ) -> Band:
-    """Arranges the blocks of a band matrix in tiles.
-
-    Args:
-        keys: `row * cameras + column` of each block in ranks, sorted, lower triangle.
-        rank: position of each camera.
-        width: bandwidth, the largest `row - column`.
-        tile: cameras per tile.
-    """
+    """Arranges the blocks of a band matrix in tiles. `keys` are `row * cameras + column` of each block in ranks,
+    sorted, lower triangle; `rank` is the position of each camera, `width` the bandwidth, the largest `row - column`,
+    and `tile` the number of cameras per tile."""
     cameras = len(rank)
     tiles = -(-cameras // tile)
     before = min(-(-width // tile), tiles - 1)  # tiles left of the diagonal one

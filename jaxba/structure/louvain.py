@@ -41,13 +41,8 @@ def camera_graph(
 
 
 def clusterings(graph: csr_matrix, largest: int, rng: np.random.Generator) -> Iterator[Int[np.ndarray, " cameras"]]:
-    """An endless sequence of clusterings: the cluster of every camera, numbered from 0.
-
-    Args:
-        graph: symmetric edge weights without a diagonal.
-        largest: largest number of cameras in a cluster.
-        rng: random generator.
-    """
+    """An endless sequence of clusterings: the cluster of every camera, numbered from 0. The graph has symmetric edge
+    weights without a diagonal; `largest` is the largest number of cameras in a cluster."""
     label = cluster(graph, largest, None, None)  # the greedy Louvain method
     while True:
         label = cluster(graph, largest, label, rng)
@@ -57,14 +52,8 @@ def clusterings(graph: csr_matrix, largest: int, rng: np.random.Generator) -> It
 def cluster(
     graph: csr_matrix, largest: int, previous: Int[np.ndarray, " cameras"] | None, rng: np.random.Generator | None
 ) -> Int[np.ndarray, " cameras"]:
-    """One clustering: the cluster of every camera, numbered from 0.
-
-    Args:
-        graph: symmetric edge weights without a diagonal.
-        largest: largest number of cameras in a cluster.
-        previous: the previous clustering, whose cut edges are contracted first; None: no such preference.
-        rng: random generator; None for greedy choices.
-    """
+    """One clustering: the cluster of every camera, numbered from 0. Arguments as for `clusterings`; the cut edges of
+    the previous clustering are contracted first (None: no such preference), and without `rng` choices are greedy."""
     nodes, edges = len(graph.indptr) - 1, graph.nnz / 2
     degree = np.asarray(graph.sum(axis=1)).ravel()
     total = max(float(degree.sum()), np.finfo(float).tiny)

@@ -126,13 +126,8 @@ def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> 
     """Room of a summation tree in a layout with fixed capacity.
 
     A target has at most `expected` items unless a camera sees a point twice. If some target has more, the tree gets
-    room for all items in one target, which takes one or two more levels.
-
-    Args:
-        counts: number of items of each target.
-        items: capacity for the items of all targets.
-        expected: largest number of items of a target if no camera sees a point twice.
-    """
+    room for all items in one target, which takes one or two more levels. `counts` are numbers of items of each target,
+    `items` is the capacity for those of all targets."""
     return Room(items, min(items, expected) if counts.max(initial=0) <= expected else items)
 
 

@@ -61,14 +61,8 @@ class Partition:
 
 
 def partition_layout(observations: ObservationOrder, slots: Slots, pairs: PairLayout, largest: int) -> Partition:
-    """Draws partitions of a problem; only one if all cameras fit in one cluster.
-
-    Args:
-        observations: the sorted observations of the problem.
-        slots: their slots.
-        pairs: pairs of the same problem, not banded.
-        largest: largest number of cameras in a cluster.
-    """
+    """Draws partitions of a problem into clusters of at most `largest` cameras; only one if all cameras fit in one
+    cluster. The pairs are not banded."""
     from jaxba.structure.louvain import camera_graph, clusterings  # SciPy: its import takes 0.2 s
 
     camera, point, cameras = observations.camera, observations.point, observations.num_cameras

@@ -110,14 +110,9 @@ UNROLLED_RANKS = 4
 
 
 def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "_ _"], ...], axis: int) -> Array:
-    """Adds to the sums of targets the items of further ranks (`sum_trees.prefix_levels`).
-
-    Args:
-        first: sums of the targets over the ranks that are not listed, along `axis`.
-        values: the items along `axis`.
-        levels: index arrays of the listed ranks.
-        axis: 0 or -1.
-    """
+    """Adds to the sums of targets the items of further ranks (`sum_trees.prefix_levels`). `first` are sums of the
+    targets over the ranks that are not listed, `levels` index arrays of those that are; `axis` is that of the items, 0
+    or -1."""
     gather = take_rows if axis == 0 else take
     sums = None
     for level in reversed(levels):

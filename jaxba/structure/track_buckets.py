@@ -51,12 +51,8 @@ class Slots(NamedTuple):
 
 
 def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALONE) -> Slots:
-    """Puts points of similar track length into buckets of shape `tiles x t x n`.
-
-    Args:
-        tracks: number of observations of each point; observations are sorted by point.
-        agreement: with the other shards of a problem, which have the same buckets.
-    """
+    """Puts points of similar track length into buckets of shape `tiles x t x n`. Observations are sorted by point, and
+    `tracks` are their numbers. The other shards of a problem (`agreement`) have the same buckets."""
     values = agreement.union("track lengths", 1 + np.flatnonzero(np.bincount(tracks)[1:]))
     own = np.bincount(tracks, minlength=int(values.max(initial=0)) + 1)[values]
     counts = np.array([agreement.size(f"points of {length}", int(n)) for length, n in zip(values, own, strict=True)])
@@ -100,12 +96,8 @@ def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slot
     """Puts points by descending track length into chunks of `POINT_CHUNK` slots, up to the capacity.
 
     The c-th chunk has slots c, c + chunks, ..., so that the sums of all chunks are dense. First come the first chunks
-    of all points, then the second chunks of those that have one, and so on.
-
-    Args:
-        tracks: number of observations of each point; observations are sorted by point.
-        capacity: sizes to pad to.
-    """
+    of all points, then the second chunks of those that have one, and so on. Observations are sorted by point, and
+    `tracks` are their numbers."""
     order = np.argsort(-tracks, kind="stable")[: np.count_nonzero(tracks)]
     members = np.full(capacity.points, capacity.points, np.int32)
     members[: len(order)] = order

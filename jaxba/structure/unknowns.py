@@ -136,12 +136,8 @@ class Unknowns(ArrayRecord):
         return self._each("mean", self.free.where(x.T, 0).T)
 
     def constant(self, intrinsics: Intrinsics, *, alone: bool) -> tuple[bool, ...]:
-        """Which columns of the blocks are constant for all cameras.
-
-        Args:
-            intrinsics: `fixed`: all intrinsics are.
-            alone: whether cameras are optimised one by one, so that what some of them share is.
-        """
+        """Which columns of the blocks are constant for all cameras: with `fixed` intrinsics all of these; where cameras
+        are optimised `alone`, one by one, what some of them share."""
         together = [alone and sharing.several for sharing, size in self._parts for _ in range(size)]
         fixed = [*[False] * POSE_SIZE, *(intrinsics == "fixed" and column < self.lens_size for column in self.columns)]
         return tuple(one or other for one, other in zip(together, fixed, strict=True))
@@ -172,15 +168,10 @@ def unknowns_of(
     fixed: bool,
     agreement: Agreement,
 ) -> Unknowns:
-    """The unknowns of a problem, for its layout.
-
-    Args:
-        problem: a checked problem, `in_frames` if it has rigs.
-        seen: whether each camera has an observation; padding cameras have none.
-        order: point of the problem at each position in layout order; out of range for padding.
-        fixed: whether all intrinsics are constant.
-        agreement: with the other shards of the problem, some of whose points may be constant.
-    """
+    """The unknowns of a problem, for its layout. The problem is `in_frames` if it has rigs. `seen`: whether each camera
+    has an observation; padding cameras have none. `order`: point of the problem at each position in layout order; out
+    of range for padding. `fixed`: whether all intrinsics are constant. Some points of other shards may be constant
+    (`agreement`)."""
     cameras, points = len(problem.cameras), len(problem.points)
     lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
     padding, index = len(seen) - cameras, np.asarray(lenses.index)

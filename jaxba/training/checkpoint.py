@@ -36,15 +36,8 @@ def pack(tree: Any) -> dict[str, np.ndarray]:
 
 
 def check(arrays: Mapping[str, Any], like: Any) -> None:
-    """Compares leaves by path with a tree.
-
-    Args:
-        arrays: see `pack`.
-        like: a tree of the expected structure, of arrays or of `jax.ShapeDtypeStruct`.
-
-    Raises:
-        TrainError: a leaf is missing, or is of another shape or type.
-    """
+    """Compares leaves by path (`pack`) with a tree of the expected structure, of arrays or of `jax.ShapeDtypeStruct`.
+    Raises TrainError: a leaf is missing, or is of another shape or type."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(like)[0]:
         if (name := _name(path)) not in arrays:
             raise TrainError(f"{name} is missing")
@@ -55,15 +48,7 @@ def check(arrays: Mapping[str, Any], like: Any) -> None:
 
 
 def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
-    """The inverse of `pack`, in newly allocated memory.
-
-    Args:
-        arrays: leaves by path.
-        like: see `check`.
-
-    Raises:
-        TrainError: see `check`.
-    """
+    """The inverse of `pack`, in newly allocated memory; arguments and errors as for `check`."""
     check(arrays, like)
 
     def leaf(path: Any, expected: Any) -> Any:
@@ -88,12 +73,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, in their order in the file.
-
-    Raises:
-        TrainError: the file is damaged.
-        OSError: it cannot be opened.
-    """
+    """All arrays of an `.npz` file, in their order in the file. Raises TrainError: the file is damaged. Raises OSError:
+    it cannot be opened."""
     with path.open("rb") as stream:
         try:
             with np.load(stream) as file:
@@ -115,19 +96,10 @@ def steps(folder: Path) -> list[int]:
 
 
 def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
-    """Writes a checkpoint, then removes all but the last `keep` up to it, and incomplete ones of a killed process.
-
-    Args:
-        folder: of all checkpoints; created if missing.
-        step: number of this checkpoint; an old one of the same number is replaced.
-        arrays: see `pack`.
-        metadata: anything that JSON can hold.
-        keep: number of checkpoints kept, this one included.
-
-    Raises:
-        TrainError: it cannot be written; those before are still there.
-        OSError: the folder cannot be created.
-    """
+    """Writes a checkpoint, over an old one of the same number, then removes all but the last `keep` up to it, this one
+    included, and incomplete ones of a killed process. The folder is created if it is missing; metadata are anything
+    that JSON can hold. Raises TrainError: it cannot be written; those before are still there. Raises OSError: the
+    folder cannot be created."""
     folder.mkdir(parents=True, exist_ok=True)
     path = _path(folder, step)
     if path.is_dir():  # no checkpoint, and in the way of one
@@ -143,11 +115,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
 
 
 def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and metadata of a checkpoint.
-
-    Raises:
-        TrainError: it cannot be read.
-    """
+    """Arrays and metadata of a checkpoint. Raises TrainError: it cannot be read."""
     path = _path(folder, step)
     try:
         arrays = read_arrays(path)

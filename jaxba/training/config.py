@@ -17,7 +17,7 @@ from jaxba.damping.features import observation_size
 from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
 from jaxba.game.scene_bank import BankConfig
-from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.problem.options import ConjugateGradients, StepOptions, check_count
 from jaxba.settings import SettingsError, configurations
 from jaxba.solver.methods import make_method
 from jaxba.training.sac import SacConfig
@@ -117,10 +117,8 @@ class TrainConfig:
 def _check_agent(sac: SacConfig) -> None:
     """Refuses impossible numbers, which would otherwise fail in tracing or give NaN."""
     for name in ("width", "layers", "batch", "target_every"):
-        if getattr(sac, name) < 1:
-            raise ValueError(f"sac.{name} must be at least 1, not {getattr(sac, name)}")
-    if sac.policy_layers < 1:
-        raise ValueError(f"sac.actor_layers must be at least 1, not {sac.actor_layers}")
+        check_count(f"sac.{name}", getattr(sac, name), 1)
+    check_count("sac.actor_layers", sac.policy_layers, 1)
     for name in ("learning_rate", "initial_temperature"):
         if not getattr(sac, name) > 0:
             raise ValueError(f"sac.{name} must be positive, not {getattr(sac, name)}")

@@ -55,7 +55,7 @@ class Outcome(NamedTuple):
     """Result of a call of `train`."""
 
     finished: bool  # false if `Hooks.stop` ended it
-    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet, or in another process than the first
+    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet
     state: LoopState  # of all agents, on a leading axis
 
 
@@ -84,18 +84,10 @@ class Hooks:
 def prepare_folder(
     folder: Path, config: TrainConfig | None, resume: bool, overrides: tuple[str, ...] = ()
 ) -> TrainConfig:
-    """Creates the folder of a new run, or reads the configuration of the run to resume.
-
-    Args:
-        folder: of the run.
-        config: of a new run; of a resumed one, None for the configuration in its folder.
-        resume: whether a run in the folder is resumed.
-        overrides: `key=value` of a resumed run.
-
-    Raises:
-        TrainError: a new run would overwrite another one, there is no run to resume, or its configuration differs.
-        SettingsError: the configuration in the folder cannot be read.
-    """
+    """Creates the folder of a new run, or reads the configuration of the run to resume. For a resumed run, `config`
+    None is the configuration in its folder, and `overrides` change that by `key=value`. Raises TrainError: a new run
+    would overwrite another one, there is no run to resume, or its configuration differs. Raises SettingsError: the
+    configuration in the folder cannot be read."""
     path = folder / CONFIG
     if path.is_file() and not resume and _others(folder):
         raise TrainError(f"{folder} holds a run already; --resume goes on with it, --out names another folder")
@@ -220,9 +212,6 @@ class _Run:
 
     def _save(self) -> None:
         arrays = checkpoint.pack({"state": self.state})
-        self._write(arrays)
-
-    def _write(self, arrays: dict[str, np.ndarray]) -> None:
         if self.best:
             actors = jax.tree.map(lambda *x: jnp.stack(x), *(one.actor for one in self.best))
             arrays = {**checkpoint.pack({"best": actors}), **arrays}

@@ -29,16 +29,8 @@ class Log:
     """
 
     def __init__(self, folder: Path, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
-        """Opens the log of a run.
-
-        Args:
-            folder: of the run.
-            chunk: chunks that are done.
-            report: called with a line of text if damaged lines are dropped.
-
-        Raises:
-            OSError: the file cannot be read or written.
-        """
+        """Opens the log of a run of which so many chunks are done; `report` is called with a line of text if damaged
+        lines are dropped. Raises OSError: the file cannot be read or written."""
         self.path, self._chunk = folder / FILE, chunk
         self._boards: dict[int, Any] = {}  # by the number of the agent
         lines, damaged = _lines(self.path)

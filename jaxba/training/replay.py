@@ -42,12 +42,8 @@ def init(capacity: int, observation_size: int, action_size: int) -> Replay:
 
 
 def add(buffer: Replay, transitions: Transition) -> Replay:
-    """Writes a batch of transitions, over the oldest ones if the buffer is full.
-
-    Args:
-        buffer: with a capacity of at least the batch.
-        transitions: with one leading axis; of any floating point type.
-    """
+    """Writes a batch of transitions, over the oldest ones if the buffer is full. The buffer has a capacity of at least
+    the batch; transitions have one leading axis, and are of any floating point type."""
     capacity = buffer.rows.shape[0]
     columns = [jnp.asarray(x, jnp.float32) for x in transitions]
     observation, action, reward, next_observation, discount = columns

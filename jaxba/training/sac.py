@@ -103,15 +103,8 @@ def _value(config: SacConfig) -> Any:
 
 
 def init(config: SacConfig, key: Array, observation_size: int, action_size: int, privileged_size: int = 0) -> Learner:
-    """An untrained agent.
-
-    Args:
-        config: static.
-        key: of the parameters and all later random numbers.
-        observation_size: features of an observation.
-        action_size: numbers of an action.
-        privileged_size: how many of the features, the last ones, the actor does not see.
-    """
+    """An untrained agent. The key is that of the parameters and of all later random numbers. The actor does not see the
+    last `privileged_size` features of an observation."""
     key, actor_key, critic_key, value_key = jax.random.split(key, 4)
     observation, action = jnp.zeros((1, observation_size), jnp.float32), jnp.zeros((1, action_size), jnp.float32)
     public = observation[:, : observation_size - privileged_size]
@@ -138,14 +131,8 @@ def init(config: SacConfig, key: Array, observation_size: int, action_size: int,
 def act(
     config: SacConfig, actor: Any, observation: Float[Array, "*batch features"], key: Array | None
 ) -> Float[Array, "*batch actions"]:
-    """Actions in (-1, 1).
-
-    Args:
-        config: static.
-        actor: `Learner.actor`.
-        observation: of any floating point type; what the actor does not see may follow.
-        key: of the sample; if None, the action is the hyperbolic tangent of the mean.
-    """
+    """Actions in (-1, 1): sampled, or without a key the hyperbolic tangent of the mean. Observations are of any
+    floating point type; what the actor does not see may follow."""
     network = _actor(config, networks.action_size(actor, config.policy_layers))
     seen = jnp.asarray(observation, jnp.float32)[..., : networks.input_size(actor)]
     mean, log_std = network.apply(actor, seen)
@@ -165,17 +152,9 @@ def act_with_value(
 
 
 def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """One gradient step: critics, then actor, then temperature or value network, then target network.
-
-    Args:
-        config: static.
-        learner: before the step.
-        batch: transitions with one leading axis.
-
-    Returns:
-        The new learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)),
-        `temperature` (before its step) and, with a value network, `value_loss`.
-    """
+    """One gradient step: critics, then actor, then temperature or value network, then target network. Returns the new
+    learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)), `temperature`
+    (before its step) and, with a value network, `value_loss`."""
     observation, action, reward, next_observation, discount = (jnp.asarray(x, jnp.float32) for x in batch)
     inputs = networks.input_size(learner.actor)
     public, next_public = observation[:, :inputs], next_observation[:, :inputs]

@@ -148,18 +148,10 @@ def build(
     report: Callable[[str], None] = lambda _: None,
     baselines: Sequence[str] | None = None,
 ) -> Task:
-    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder.
-
-    Args:
-        config: of the run that the folder belongs to.
-        folder: of the run.
-        report: called with a line of text when something begins that takes a while.
-        baselines: names to compare with, unless the folder has their results already; `BASELINES` if None.
-
-    Raises:
-        ValueError: too few scenes are usable, or another version wrote the files. One line for a person.
-        OSError: the folder cannot be written or read.
-    """
+    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. `report` is called with a
+    line of text when something begins that takes a while; `baselines` are names to compare with, unless the folder has
+    their results already; `BASELINES` if None. Raises ValueError: too few scenes are usable, or another version wrote
+    the files; one line for a person. Raises OSError: the folder cannot be written or read."""
     splits = _splits(config, folder, report)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
@@ -206,14 +198,9 @@ def _baseline_runs(
 def baseline_policies(
     config: TrainConfig, options: StepOptions, names: Sequence[str]
 ) -> dict[str, tuple[DampingPolicy, StepOptions]]:
-    """Policy and step of every baseline, in the order of the table.
-
-    Args:
-        config: of the run.
-        options: of the agent's step.
-        names: as in `BASELINES`, without `CONSTANT`. Those with embedded iterations, `guarded` among them, are left
-            out if the agent's step has none; the rule that belongs to the method comes first.
-    """
+    """Policy and step of every baseline, in the order of the table; `options` are those of the agent's step. Names are
+    as in `BASELINES`, without `CONSTANT`. Those with embedded iterations, `guarded` among them, are left out if the
+    agent's step has none; the rule that belongs to the method comes first."""
     plain = config.step_options
     has_embedded = options.refinement != plain.refinement
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
@@ -245,11 +232,7 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
 
 
 def read_banks(path: Path) -> list[Split]:
-    """The scenes of a run's folder.
-
-    Raises:
-        TrainError: another version wrote them, or the file is damaged.
-    """
+    """The scenes of a run's folder. Raises TrainError: another version wrote them, or the file is damaged."""
     arrays = _read(path)
     classes = dict.fromkeys(name.partition("/")[0] for name in arrays)
     return [_named_tuple(path, Split, f"{number}/", arrays) for number in classes]

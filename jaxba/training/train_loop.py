@@ -18,12 +18,12 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.game.protocol import Environment, Step
+from jaxba.problem.options import check_count
 from jaxba.runtime.jit import jit
 from jaxba.training import replay as ring
 from jaxba.training import sac as agent
 from jaxba.training.replay import Replay, Transition
 from jaxba.training.sac import Learner, SacConfig
-from jaxba.typing import LARGEST_COUNT
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,7 @@ class LoopConfig:
     def __post_init__(self) -> None:
         """Checks that all counts are positive and fit 32 bits."""
         for name in ("replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-            if getattr(self, name) > LARGEST_COUNT:
-                raise ValueError(f"{name} must be at most {LARGEST_COUNT}, not {getattr(self, name)}")
+            check_count(name, getattr(self, name), 1)
 
 
 class LoopState(NamedTuple):
@@ -67,7 +64,9 @@ class LoopState(NamedTuple):
 def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions"]) -> tuple[LoopState, Step]:
     """One vector step, stored in the buffer. A truncated episode has discount 1 and its true last observation."""
     env_state, step = env.step(state.env_state, action)
-    _check_step(env, step)
+    # refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast
+    chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
+    chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
     transitions = Transition(
         state.observation, action, step.reward, step.final_observation, 1.0 - jnp.asarray(step.terminated, jnp.float32)
     )
@@ -80,26 +79,10 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
     return after, step
 
 
-def _check_step(env: Environment, step: Step) -> None:
-    """Refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast.
-
-    Raises:
-        AssertionError: naming the shapes.
-    """
-    chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
-    chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
-
-
 @functools.partial(jit, static_argnames=("sac", "loop"))
 def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
-    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: a pytree; its arrays are traced.
-        key: of all random numbers; the same key gives bitwise identical results on the same machine.
-    """
+    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions. Arrays of `env`, a pytree,
+    are traced. The same key gives bitwise identical results on the same machine."""
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
     env_state, observation = env.reset(reset_key)
     chex.assert_shape(observation, (env.num_envs, env.observation_size))
@@ -126,21 +109,13 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
 def run_chunk(
     sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
 ) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
-    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: the one of `start`.
-        state: donated; its memory is reused for the result.
-
-    Returns:
-        The state after the chunk, and means over it: those of `sac.update`; `reward` of a step; `action_mean`,
-        `action_std`; `action_spread`, the standard deviation of the mean action over replayed states; `q_bias`, what
-        the critics expected more than what came, entropy included, in episodes that were terminated (NaN if none was);
-        `episodes`, the number of episodes that ended, and `episode/NAME`, the mean of a metric of the
-        environment over them (0 if none ended); `dropped`, transitions with numbers that are not finite.
-    """
+    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates. The state is
+    donated; its memory is reused for the result. Returns the state after the chunk, and means over it: those of
+    `sac.update`; `reward` of a step; `action_mean`, `action_std`; `action_spread`, the standard deviation of the mean
+    action over replayed states; `q_bias`, what the critics expected more than what came, entropy included, in episodes
+    that were terminated (NaN if none was); `episodes`, the number of episodes that ended, and `episode/NAME`, the mean
+    of a metric of the environment over them (0 if none ended); `dropped`, transitions with numbers that are not
+    finite."""
 
     def body(state: LoopState, _: None) -> tuple[LoopState, tuple[Any, ...]]:
         key, act_key, sample_key = jax.random.split(state.key, 3)
@@ -200,14 +175,8 @@ def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
 
 @functools.partial(jit, static_argnames=("sac", "loop"))
 def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
-    """`start` for several agents, which share the environment's scenes; the state has a first axis of agents.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: a pytree.
-        keys: one of each agent.
-    """
+    """`start` for several agents, one for each key, which share the environment's scenes; the state has a first axis of
+    agents."""
     return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
 
 

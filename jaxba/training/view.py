@@ -26,15 +26,9 @@ def lines(
     rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool = False, decades: float = 5.5
 ) -> list[str]:
     """A line on a finished chunk and one on the agents' health, and one on held-out scores if there are any. The last
-    one is a warning if there are scores, and some agents' policies are the same everywhere or random.
-
-    Args:
-        rows: of the chunk in the log, one of every agent.
-        chunks: of the whole training.
-        rules: a `Score` by name of the baseline.
-        best: whether a policy of this chunk is the best so far.
-        decades: of lambda that an action of 1 is above 0.
-    """
+    one is a warning if there are scores, and some agents' policies are the same everywhere or random. Rows are those of
+    one chunk in the log, one of every agent, of so many chunks in all; `rules` has a `Score` by name of the baseline.
+    `best`: whether a policy of this chunk is the best so far. `decades`: of lambda that an action of 1 is above 0."""
     row = rows[0]
     start, end = f"chunk {row['chunk']}/{chunks}: ", row["wall_s"] / row["chunk"] * chunks
     text = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"

@@ -42,13 +42,8 @@ class Frusta(NamedTuple):
 
 
 def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | None = None) -> Frusta:
-    """The frusta of all cameras.
-
-    Args:
-        problem: cameras and observations.
-        sizes: width and height of images, pixels; None, or 0 for an image: from the principal point, or where there is
-            none as far as its observations reach.
-    """
+    """The frusta of all cameras. `sizes` are width and height of images, pixels; None, or 0 for an image: from the
+    principal point, or where there is none as far as its observations reach."""
     numbers = np.asarray(problem.cameras)[:, POSE_SIZE:]
     count = len(numbers)
     focal, center, flipped = np.ones((count, 2)), np.zeros((count, 2)), np.zeros(count, bool)
@@ -118,12 +113,9 @@ def depth_of_image(half: Float[np.ndarray, "cameras 2"], scale: float) -> Float[
 def residual_segments(
     problem: BundleProblem, frusta: Frusta, residuals: Float[np.ndarray, "observations 2"], camera: int
 ) -> tuple[Float[np.ndarray, "own 2 2"], float]:
-    """Residuals of an image as segments from each measured pixel towards the predicted one, in its plane.
-
-    Returns:
-        The segments, and by how much they are magnified: the median is at least as long as a twentieth of the image's
-        width. None is longer than that width. Non-finite residuals are left out.
-    """
+    """Residuals of an image as segments from each measured pixel towards the predicted one, in its plane. Returns the
+    segments, and by how much they are magnified: the median is at least as long as a twentieth of the image's width.
+    None is longer than that width. Non-finite residuals are left out."""
     own = np.flatnonzero((np.asarray(problem.camera_index) == camera) & np.isfinite(residuals).all(axis=1))
     pixels, difference = np.asarray(problem.observations)[own], residuals[own]
     length = np.linalg.norm(difference, axis=1)

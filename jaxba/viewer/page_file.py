@@ -21,11 +21,8 @@ LISTED = 5
 
 
 def write_page(all_shown: Sequence[Shown], path: StrPath) -> None:
-    """Writes a page that plays the iterations of all solves, in step; the worst image at the end is marked.
-
-    Raises:
-        ProblemError: it cannot be written.
-    """
+    """Writes a page that plays the iterations of all solves, in step; the worst image at the end is marked. Raises
+    ProblemError: it cannot be written."""
     server = start_server()
     try:
         drawn = stages(server, all_shown, points=PAGE_POINTS, caption="numbers")

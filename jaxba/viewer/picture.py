@@ -18,13 +18,8 @@ def picture_of(
     size: Float[np.ndarray, "2"],
     segments: Float[np.ndarray, "own 2 2"],
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Draws segments, with a dot where each begins.
-
-    Args:
-        photo: the image, of any size; None if it is not at hand.
-        size: width and height of the image, pixels.
-        segments: their ends, pixels from the upper left corner.
-    """
+    """Draws segments on an image of this width and height, with a dot where each begins; their ends are pixels from its
+    upper left corner. The photo may have any size; None if it is not at hand."""
     scale = WIDTH / size[0]
     canvas = Image.new("RGB", (WIDTH, max(round(size[1] * scale), 1)), WHITE)
     if photo is not None:

@@ -20,6 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import Labels
+from jaxba.problem.residuals import Residuals
 from jaxba.solver.drivers import IterationRecord
 
 RECORDED_POINTS = 20_000
@@ -86,20 +87,10 @@ def evenly(count: int, limit: int) -> Int[np.ndarray, " kept"]:
 
 def of_points(problem: BundleProblem, kept: Int[np.ndarray, " kept"]) -> BundleProblem:
     """A problem of some of the points and their observations, for looking at: without constants and priors."""
-    number = np.full(problem.num_points, -1)
-    number[kept] = np.arange(len(kept))
-    index = number[np.asarray(problem.point_index)]
-    there = index >= 0
-    labels = problem.labels
-    return BundleProblem(
-        np.asarray(problem.cameras),
-        np.asarray(problem.points)[kept],
-        np.asarray(problem.observations)[there],
-        np.asarray(problem.camera_index)[there],
-        index[there].astype(np.int32),
-        lenses=problem.lenses,
-        labels=labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept]),
-    )
+    labels, none = problem.labels, dict.fromkeys(("whitening", "constants", "rigs"))
+    found = problem.replace(residuals=Residuals(), **none).subset(np.isin(problem.point_index, kept), points=kept)
+    labels = labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept])
+    return found.replace(cameras=np.asarray(problem.cameras), labels=labels)
 
 
 def still(problem: BundleProblem) -> Recording:
@@ -142,11 +133,8 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 
 
 def write_recording(recording: Recording, path: StrPath) -> None:
-    """Writes a recording, whole or not at all. Points are float32, relative to their middle.
-
-    Raises:
-        ProblemError: it cannot be written.
-    """
+    """Writes a recording, whole or not at all. Points are float32, relative to their middle. Raises ProblemError: it
+    cannot be written."""
     problem, lenses = recording.problem, recording.problem.lenses
     middle = np.median(recording.points[-1], axis=0)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
@@ -164,11 +152,7 @@ def write_recording(recording: Recording, path: StrPath) -> None:
 
 
 def read_recording(path: StrPath) -> Recording:
-    """Reads a recording.
-
-    Raises:
-        ProblemError: it is not one of `jaxba-solve --record`; one line.
-    """
+    """Reads a recording. Raises ProblemError: it is not one of `jaxba-solve --record`; one line."""
     name = display_name(path)
     try:
         with np.load(path, allow_pickle=False) as file:

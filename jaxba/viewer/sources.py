@@ -83,15 +83,8 @@ def shown(what: BundleProblem | Recording, name: str) -> Shown:
 
 
 def open_all(paths: Sequence[str], images: str | None = None) -> list[Shown]:
-    """Opens files.
-
-    Args:
-        paths: of problems in any format that is read, names of downloaded BAL problems, or recordings.
-        images: folder of the images.
-
-    Raises:
-        ProblemError: a file cannot be read; one line.
-    """
+    """Opens problems in any format that is read, names of downloaded BAL problems, or recordings; `images` is the
+    folder of the images. Raises ProblemError: a file cannot be read; one line."""
     found = [_open(path) for path in paths]
     sides = [_sidecar(path, one) for path, one in zip(paths, found, strict=True)]
     return [_with_frames(one, sides, images) for one in found]

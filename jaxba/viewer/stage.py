@@ -55,17 +55,9 @@ class Stage:
         on_click: Callable[[int], None] | None = None,
         caption: str = "",
     ) -> None:
-        """Draws the last iteration.
-
-        Args:
-            server: owner of the scene.
-            shown: what to draw.
-            key: name in the tree of the scene.
-            place: number among those side by side.
-            points: most points that are drawn.
-            on_click: called with the number of an image whose frustum was clicked.
-            caption: text above the scene, `""`, `"name"`, or `"numbers"` with those of the iteration.
-        """
+        """Draws the last iteration, with at most so many points. `key` is the name in the tree of the scene, `place`
+        the number among those side by side; `on_click` is called with the number of an image whose frustum was clicked.
+        The caption above the scene is `""`, `"name"`, or `"numbers"` with those of the iteration."""
         self.shown, self._server, self._on_click = shown, server, on_click
         self._caption, recording = caption, shown.recording
         self.iteration, self.colour, self.chosen = recording.last, self.colour_choices()[0], None
@@ -182,12 +174,6 @@ class Stage:
         np.fill_diagonal(distance, np.inf)
         return float(np.clip(0.5 * np.median(distance.min(axis=1)), 0.015, 0.15))
 
-    def _corners(self, poses: Float[np.ndarray, "n 3 4"], half: Float[np.ndarray, "n 2"]) -> np.ndarray:
-        """Corners of images on the page, shape (n, 4, 3)."""
-        return self._on_page(
-            poses[:, None], _CORNERS * half[:, None], geometry.depth_of_image(half, self._size)[:, None]
-        )
-
     def _on_page(self, poses: np.ndarray, plane: np.ndarray, depth: Any) -> np.ndarray:
         """Places on the page of places in the planes at distance 1 before cameras, at a depth."""
         local = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) * np.asarray(depth)[..., None]
@@ -208,7 +194,9 @@ class Stage:
     def _draw_start(self) -> None:
         start = self.shown.problem
         poses = self._similarity.poses(camera_poses(start.cameras))[self.frusta]
-        corners = self._corners(poses, self.image_planes.half[self.frusta])
+        half = self.image_planes.half[self.frusta]
+        depth = geometry.depth_of_image(half, self._size)
+        corners = self._on_page(poses[:, None], _CORNERS * half[:, None], depth[:, None])  # of images, (n, 4, 3)
         apex = np.broadcast_to(poses[:, None, :, 3], corners.shape)
         around = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
         spokes = np.stack([apex, corners], axis=2)
@@ -223,11 +211,8 @@ class Stage:
             self.layers.label(text, (0.0, 0.0, float(np.percentile(points[:, 2], 95)) + 0.3))
 
     def numbers(self, between: str = ", ") -> str:
-        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error.
-
-        Args:
-            between: what stands between the parts.
-        """
+        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error. `between` stands between
+        the parts."""
         recording, k = self.shown.recording, self.iteration
         error = f"RMSE {self.measures.rmse:.4g} px"
         if recording.last == 0:

@@ -109,14 +109,7 @@ def _profiles(runner: Runner) -> list[Part]:
 
 def speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> claims.Claim:
     """The claim on the ratio of our time to classic's, a geometric mean over the problems on which both reach the
-    tolerance.
-
-    Args:
-        records: solves of both.
-        tau: tolerance.
-        text: the claim in words.
-        faster: whether the claim is that ours is faster; otherwise, that it is not.
-    """
+    tolerance. The claim is that ours is faster, or else that it is not; the records are solves of both."""
     table = profile.reach_table(records, Target("tau", tau))
     ours, classic = table.get(agents.BEST.name, {}), table.get(CLASSIC, {})
     names = [name for name in ours if name in classic]
