@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import time
 
-import gtsam
+import gtsam  # pyright: ignore[reportMissingImports]
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxba.problem.checks import indices, inverse_roots, real_numbers
 from jaxba.problem.constants import Constants, checked_constants
-from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
+from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
 from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import Rigs, checked_rigs
@@ -110,8 +110,8 @@ class BundleProblem(ArrayRecord):
         Args:
             cameras: shape (cameras, 9), or (cameras, 6 + numbers of the largest camera model).
             points: shape (points, 3).
-            observations: shape (observations, 2), pixels. Without them and points a problem has cameras alone, and
-                needs other residuals (`jaxba.with_residual`): a pose graph.
+            observations: shape (observations, 2), pixels. Without them and points a problem has cameras alone, whose
+                lenses are constant, and needs other residuals (`jaxba.with_residual`): a pose graph.
             camera_index: shape (observations,), integers in [0, cameras).
             point_index: shape (observations,), integers in [0, points).
             covariance: optional, shape (observations, 2, 2), pixels squared; symmetric and
@@ -138,6 +138,7 @@ class BundleProblem(ArrayRecord):
             alone = points is None and observations is None
             if alone:
                 points, observations = np.zeros((0, POINT_SIZE)), np.zeros((0, 2))
+                lenses = lenses or Lenses(np.arange(len(cameras)), np.zeros((len(cameras), LENS_SIZE), bool))
             points = _floats("points", points, POINT_SIZE)
             observations = _floats("observations", observations, 2)
             whitening = _whitening(covariance, weight, len(observations))

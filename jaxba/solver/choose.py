@@ -21,6 +21,7 @@ from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_small_capacitance, is_dense
 from jaxba.structure.observation_order import ObservationOrder
+from jaxba.structure.residual_slots import stands_for_rows
 
 Work = dict[str, Any]
 """Amounts of work of an iteration, by the keys of `SECONDS`."""
@@ -111,11 +112,13 @@ def choose_linear_solver(
 
 
 def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
-    """The linear solver with the lowest predicted time to convergence. Arguments as for `work`."""
-    times = {
-        name: time if name == "explicit" else INEXACT_ITERATIONS * time
-        for name, time in predict(problem, observations).items()
-    }
+    """The linear solver with the lowest predicted time to convergence. Without pixels, as in a pose graph, it is a
+    factorisation if memory allows: conjugate gradients take some 75 products a step there, and twice to six times the
+    iterations (`python -m benchmarks.pose_graph`). Arguments as for `work`."""
+    predicted = predict(problem, observations)
+    if problem.residuals and stands_for_rows(problem).all() and np.isfinite(predicted["explicit"]):
+        return "explicit"
+    times = {name: time if name == "explicit" else INEXACT_ITERATIONS * time for name, time in predicted.items()}
     return min(times, key=lambda name: times[name])  # type: ignore[return-value]
 
 

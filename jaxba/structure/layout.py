@@ -41,7 +41,7 @@ from jaxba.structure.density import is_dense
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.random_partitions import Partition, partition_layout
-from jaxba.structure.residual_slots import ResidualSlots, residual_slots
+from jaxba.structure.residual_slots import ResidualSlots, residual_slots, stands_for_rows
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
@@ -224,7 +224,7 @@ def build_layout(
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slots.point,
-        slot_mask=in_slots(~_stands_for_rows(problem)[order]),
+        slot_mask=in_slots(~stands_for_rows(problem)[order]),
         observation=in_slots(order.astype(np.int32), len(order)),
         pixels=in_order(problem.observations),
         whitening=None if problem.whitening is None else in_order(problem.whitening),
@@ -240,14 +240,6 @@ def build_layout(
         residuals=residual_slots(problem, slot, order, slots.points, agreement.within("residuals")),
         buckets=slots.buckets,
     )
-
-
-def _stands_for_rows(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
-    """Which observations have no pixels, but stand for rows of residuals (structure/residual_slots.py)."""
-    found = np.zeros(problem.num_observations, bool)
-    for rows in problem.residuals.rows:
-        found[rows.observation[rows.observation >= 0]] = True
-    return found
 
 
 def num_partitions(layout: Layout) -> int:

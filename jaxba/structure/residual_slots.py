@@ -19,7 +19,7 @@ import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.constants import Constants
@@ -110,6 +110,14 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         rigs=rigs,
         residuals=replace(residuals, rows=tuple(found), groups=tuple(groups)),
     )
+
+
+def stands_for_rows(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
+    """Which observations have no pixels, but stand for rows of residuals."""
+    found = np.zeros(problem.num_observations, bool)
+    for rows in problem.residuals.rows:
+        found[rows.observation[rows.observation >= 0]] = True
+    return found
 
 
 def with_block_values(
