@@ -21,8 +21,6 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.method import check_plain
@@ -184,6 +182,9 @@ def deal_points(
     of_point[order] = shard
     pairs = [own for own in together if len(own) == 2]
     if pairs:
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
         first, second = (np.concatenate([own[k] for own in pairs]) for k in range(2))
         graph = coo_array((np.ones(len(first)), (first, second)), (len(tracks), len(tracks)))
         _, group = connected_components(graph, directed=False)

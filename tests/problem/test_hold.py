@@ -333,7 +333,7 @@ def test_the_covariance_of_a_relative_pose_does_not_depend_on_the_gauge():
 
 
 def test_prepare_takes_what_is_constant_and_known():
-    assert [len(rows.point) for rows in prepare(known()).layout.residuals] == [4, 6, 6]
+    assert [len(rows.points[0]) for rows in prepare(known()).layout.residuals] == [4, 6, 6]
     assert not prepare(held()).layout.unknowns.free.everywhere
 
 
