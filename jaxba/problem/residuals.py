@@ -44,6 +44,9 @@ class Residual:
     data: tuple[str, ...]
     """Names of its keyword-only parameters."""
 
+    source: str = field(default="", compare=False)
+    """What determines the computations of the function once it is registered, a digest; empty if nothing does."""
+
     @property
     def name(self) -> str:
         """Name of the function: the kind of its costs."""

@@ -232,6 +232,8 @@ def _describe(value: Any) -> str:
         return f"({', '.join(map(_describe, value))})"
     if isinstance(value, dict):
         return f"{{{', '.join(f'{_describe(key)}: {_describe(value[key])}' for key in sorted(value))}}}"
+    if isinstance(known := getattr(value, "source", None), str) and known:
+        return f"{_name(type(value))}({known})"  # of a function from elsewhere, which has been traced
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return f"{_name(type(value))}{_describe(dict(fields))}"
