@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxba import residuals
 from jaxba.damping import (
     POLICIES,
     Ceres,
@@ -142,6 +143,7 @@ __all__ = [
     "register_pytree",
     "release",
     "residual",
+    "residuals",
     "retriangulate",
     "save_policy",
     "scene_like",

@@ -112,7 +112,8 @@ def angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
     best = jnp.take_along_axis(rows, jnp.argmax(squares, axis=1)[:, None, None], axis=1)[:, 0]
     best = best / jnp.linalg.norm(best, axis=1, keepdims=True)
     best = jnp.where(best[:, :1] < 0, -best, best)
-    sine = jnp.linalg.norm(best[:, 1:], axis=1)
-    angle = 2 * jnp.arctan2(sine, best[:, 0])
-    scale = jnp.where(sine > 1e-12, angle / jnp.maximum(sine, 1e-12), 2.0)
+    squared = jnp.sum(best[:, 1:] ** 2, axis=1)
+    small = squared < 1e-24
+    sine = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), squared))
+    scale = jnp.where(small, 2.0, 2 * jnp.arctan2(sine, best[:, 0]) / sine)
     return best[:, 1:] * scale[:, None]

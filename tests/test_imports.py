@@ -19,13 +19,14 @@ from conftest import LABORATORY
 import jaxba
 
 ORDER = (
-    *("typing", "runtime", "rotations", "problem", "io", "settings", "structure", "model", "linear", "refinement"),
-    *("lm", "damping", "solver", "results", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti", "game"),
-    *("training", "peers", "bench", "paper", "cli"),
+    *("typing", "runtime", "rotations", "problem", "residuals", "io", "settings", "structure", "model", "linear"),
+    *("refinement", "lm", "damping", "solver", "results", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti"),
+    *("game", "training", "peers", "bench", "paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 
 NO_MORE_THAN = {
+    "residuals": {"typing", "runtime", "rotations", "problem"},
     "runtime": {"typing"},
     "io": {"typing", "runtime", "problem"},
     "settings": {"typing", "runtime", "problem", "io"},

@@ -38,6 +38,10 @@ class Pose(NamedTuple):
         """A point of the world in the camera's frame; its last number is the depth."""
         return _times(self.rotation, point) + self.translation
 
+    def to_world(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """A point in the camera's frame as one of the world."""
+        return _times(self.rotation.T, point - self.translation)
+
     def between(self, other: Pose) -> Pose:
         """From the frame of this camera to that of another: `P_2 = R P_1 + t`."""
         rotation = other.rotation @ self.rotation.T

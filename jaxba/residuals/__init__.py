@@ -1,0 +1,15 @@
+"""Residuals ready to use with `jaxba.with_residual`: what surveyors, robots, depth maps and lenses say besides pixels.
+
+Data are whitened by `sigma`, a standard deviation, or by `whitening`, `Sigma^(-1/2)` of a covariance. Lengths are in
+scene units and in the frame that the problem has when the rows are registered, angles in radians, rotations matrices,
+cameras' axes those of COLMAP (`jaxba.problem.row_value.Pose`).
+"""
+
+from jaxba.residuals.imu import imu, preintegrated
+from jaxba.residuals.lenses import lens_bounds, lens_default, lens_defaults
+from jaxba.residuals.points import control_point, depth, distance, point_to_plane, rolling_shutter
+from jaxba.residuals.poses import baseline, gravity, heading, position, relative_pose
+
+__all__ = ["baseline", "control_point", "depth", "distance", "gravity", "heading", "imu", "lens_bounds"]
+__all__ += ["lens_default", "lens_defaults", "point_to_plane", "position", "preintegrated", "relative_pose"]
+__all__ += ["rolling_shutter"]

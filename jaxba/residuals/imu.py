@@ -1,0 +1,136 @@
+"""Measurements of an inertial measurement unit (IMU) between images, integrated once for all solves.
+
+Source: Forster et al. 2017, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", with the midpoint rule
+instead of Euler's, measurements interpolated between samples, and derivatives by JAX.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.problem.checks import finite
+from jaxba.problem.residuals import residual
+from jaxba.rotations import angle_axis, rotation_matrix
+from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import numerics
+
+
+@residual
+def imu(
+    pose,
+    motion,
+    pose_2,
+    motion_2,
+    *,
+    rotation,
+    velocity,
+    position,
+    by_bias,
+    bias,
+    duration,
+    whitening,
+    gravity,
+    axes,
+    arm,
+):
+    """What an IMU measured between two images, and the random walk of its biases (fifteen numbers: rotation, velocity,
+    position, bias of the gyroscope, bias of the accelerometer; Forster et al. 2017, eqs. 44, 45 and 48).
+
+    The block `motion` has nine numbers of each image: velocity in the world, and the biases. `preintegrated` makes the
+    data up to `whitening`, for image after image. `gravity` (3) is in the world, such as (0, 0, -9.81). `axes` (3, 3)
+    turns the IMU's axes to the camera's, `arm` (3) is its place in the camera's frame. Scene units are those of the
+    accelerations, metres."""
+    changed = by_bias @ (motion[3:] - bias)
+    first, second = pose.rotation.T @ axes, pose_2.rotation.T @ axes
+    turn = (rotation @ _exponential(changed[:3])).T @ first.T @ second
+    speed = first.T @ (motion_2[:3] - motion[:3] - duration * gravity)
+    way = pose_2.to_world(arm) - pose.to_world(arm) - duration * (motion[:3] + 0.5 * duration * gravity)
+    delta = jnp.concatenate([speed - velocity, first.T @ way - position]) - changed[3:]
+    return whitening @ jnp.concatenate([angle_axis(turn[None])[0], delta, motion_2[3:] - motion[3:]])
+
+
+def preintegrated(
+    times: Any,
+    angular_rates: Any,
+    accelerations: Any,
+    moments: Any,
+    *,
+    gyro_noise: float,
+    accelerometer_noise: float,
+    gyro_walk: float,
+    accelerometer_walk: float,
+    bias: Any = (0.0,) * 6,
+) -> dict[str, Float[np.ndarray, "..."]]:
+    """The data of `imu` from samples of an IMU: a row for each pair of successive images.
+
+    Args:
+        times: of the samples, ascending, shape (n,), seconds.
+        angular_rates: shape (n, 3), rad/s.
+        accelerations: specific forces as an accelerometer measures them (at rest: up), shape (n, 3), m/s^2.
+        moments: of the images, ascending, within `times`, shape (m + 1,), seconds.
+        gyro_noise, accelerometer_noise: densities of white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
+        gyro_walk, accelerometer_walk: of the random walk of the biases, rad/s^2/sqrt(Hz) and m/s^3/sqrt(Hz). These four
+            are as in Kalibr's files.
+        bias: of the gyroscope and the accelerometer, about which the result is linear, shape (6,).
+
+    Raises:
+        ValueError: shapes, or times that do not ascend or do not enclose the images; one line.
+    """
+    t = finite("times", times, (np.size(times),))
+    at = finite("moments", moments, (np.size(moments),))
+    measured = {"angular_rates": angular_rates, "accelerations": accelerations}
+    bias = finite("bias", bias, (6,))
+    samples = np.hstack([finite(name, x, (len(t), 3)) for name, x in measured.items()]) - bias
+    densities = finite("noise and walks", [gyro_noise, accelerometer_noise, gyro_walk, accelerometer_walk], (4,))
+    if len(at) < 2 or not all((np.diff(x) > 0).all() for x in (t, at)) or at[0] < t[0] or at[-1] > t[-1]:
+        raise ValueError("times and moments must ascend, and times begin before and end after the moments")
+    if not (densities > 0).all():
+        raise ValueError("noise and walks must be positive")
+    # half of an interval is a step at least: a single one would leave the covariance singular
+    knots = [np.unique([a, (a + b) / 2, b, *t[(t > a) & (t < b)]]) for a, b in pairwise(at)]
+    longest = max(map(len, knots))
+    ends = np.stack([np.pad(one, (0, longest - len(one)), mode="edge") for one in knots])
+    steps, middles = np.diff(ends), (ends[:, 1:] + ends[:, :-1]) / 2
+    between = np.stack([np.interp(middles, t, column) for column in samples.T], axis=-1)
+    with numerics(np.float64):
+        by_sample, (rotation, velocity, position) = jax.device_get(_derivatives(between, steps))
+    duration, deviation = np.diff(at), np.repeat(densities, 3)
+    rate = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)  # white noise, averaged over a step
+    scaled = by_sample * (np.sqrt(rate)[..., None] * deviation[:6])[:, None]
+    whitening = np.zeros((len(duration), 15, 15))
+    whitening[:, :9, :9] = np.linalg.inv(np.linalg.cholesky(np.einsum("minc,mjnc->mij", scaled, scaled)))
+    whitening[:, range(9, 15), range(9, 15)] = 1 / (deviation[6:] * np.sqrt(duration)[:, None])
+    found = {"rotation": rotation, "velocity": velocity, "position": position, "by_bias": -by_sample.sum(axis=2)}
+    return found | {"bias": np.tile(bias, (len(at) - 1, 1)), "duration": duration, "whitening": whitening}
+
+
+def _exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    return rotation_matrix(vector[:, None])[..., 0]
+
+
+def _integrated(samples: Float[Array, "n 6"], steps: Float[Array, " n"]) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Nine numbers with the derivatives of the rotation, by a small rotation after it, of velocity and of position;
+    and these (Forster et al. 2017, eq. 33)."""
+
+    def advance(state: tuple[Array, Array, Array], of: tuple[Array, Array]) -> tuple[tuple[Array, Array, Array], None]:
+        (rotation, velocity, position), (sample, dt) = state, of
+        half = rotation @ _exponential(0.5 * dt * sample[:3])
+        force = half @ sample[3:]
+        position = position + dt * (velocity + 0.5 * dt * force)
+        return (half @ _exponential(0.5 * dt * sample[:3]), velocity + dt * force, position), None
+
+    start = jnp.eye(3), jnp.zeros(3), jnp.zeros(3)
+    (rotation, velocity, position), _ = jax.lax.scan(advance, start, (samples, steps))
+    turn = jax.lax.stop_gradient(rotation).T @ rotation
+    vector = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return jnp.concatenate([vector, velocity, position]), (rotation, velocity, position)
+
+
+_derivatives = jit(jax.vmap(jax.jacrev(_integrated, has_aux=True)))
