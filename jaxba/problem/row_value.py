@@ -32,29 +32,25 @@ class Pose(NamedTuple):
     @property
     def center(self) -> Float[Array, "3"]:
         """The position of the camera."""
-        return -_times(self.rotation.T, self.translation)
+        return -times(self.rotation.T, self.translation)
 
     def to_camera(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """A point of the world in the camera's frame; its last number is the depth."""
-        return _times(self.rotation, point) + self.translation
-
-    def to_world(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """A point in the camera's frame as one of the world."""
-        return _times(self.rotation.T, point - self.translation)
+        return times(self.rotation, point) + self.translation
 
     def between(self, other: Pose) -> Pose:
         """From the frame of this camera to that of another: `P_2 = R P_1 + t`."""
         rotation = other.rotation @ self.rotation.T
-        return Pose(rotation, other.translation - _times(rotation, self.translation))
+        return Pose(rotation, other.translation - times(rotation, self.translation))
 
     def turn_from(self, rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
         """The angle-axis vector w with `R = exp(w) rotation`, in the camera's axes, radians."""
         return angle_axis((self.rotation @ rotation.T)[None])[0]
 
 
-def _times(matrix: Array, vector: Array) -> Array:
+def times(matrix: Array, vector: Array) -> Array:
     """The product with a vector, term by term, which XLA fuses with what surrounds it."""
-    return sum(matrix[:, k] * vector[k] for k in range(3))  # pyright: ignore[reportReturnType]
+    return sum(matrix[:, k] * vector[k] for k in range(len(vector)))  # pyright: ignore[reportReturnType]
 
 
 class Lens(NamedTuple):
@@ -105,10 +101,10 @@ def value(
         base = name.removesuffix(SECOND)
         which = int(name.endswith(SECOND) and len(points if base == POINT else cameras.rotation) > 1)
         if base == POINT:
-            arguments.append(scale * _times(turn, points[which]) + shift)
+            arguments.append(scale * times(turn, points[which]) + shift)
         elif base == POSE:
-            rotation = jnp.stack([_times(turn, row) for row in cameras.rotation[which]])
-            moved = scale * cameras.translation[which] - _times(rotation, shift)
+            rotation = jnp.stack([times(turn, row) for row in cameras.rotation[which]])
+            moved = scale * cameras.translation[which] - times(rotation, shift)
             arguments.append(Pose(axes[:, None] * rotation, axes * moved))
         elif base == LENS:
             arguments.append(Lens(cameras.lenses[which], cameras.model[which], cameras.models))

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from jaxba.problem.checks import finite
 from jaxba.problem.residuals import residual
+from jaxba.problem.row_value import times
 from jaxba.rotations import angle_axis, rotation_matrix
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
@@ -24,36 +25,24 @@ from jaxba.runtime.numerics import numerics
 
 @residual
 def imu(
-    pose,
-    motion,
-    pose_2,
-    motion_2,
-    *,
-    rotation,
-    velocity,
-    position,
-    by_bias,
-    bias,
-    duration,
-    whitening,
-    gravity,
-    axes,
-    arm,
+    pose, motion, pose_2, motion_2, *, rotation, velocity, position, by_bias, bias, duration, whitening, gravity, mount
 ):
     """What an IMU measured between two images, and the random walk of its biases (fifteen numbers: rotation, velocity,
     position, bias of the gyroscope, bias of the accelerometer; Forster et al. 2017, eqs. 44, 45 and 48).
 
-    The block `motion` has nine numbers of each image: velocity in the world, and the biases. `preintegrated` makes the
-    data up to `whitening`, for image after image. `gravity` (3) is in the world, such as (0, 0, -9.81). `axes` (3, 3)
-    turns the IMU's axes to the camera's, `arm` (3) is its place in the camera's frame. Scene units are those of the
-    accelerations, metres."""
+    The block `motion` has nine numbers of each image: velocity of the IMU in the world, and the biases. `preintegrated`
+    makes the data up to `whitening`, for image after image. `gravity` (3) is in the world, such as (0, 0, -9.81).
+    `mount` (3, 4) is `[R | t]` from the IMU's frame to the camera's, Kalibr's `T_cam_imu`. Scene units are those of
+    the accelerations, metres."""
     changed = by_bias @ (motion[3:] - bias)
-    first, second = pose.rotation.T @ axes, pose_2.rotation.T @ axes
+    first, second = (one.rotation.T @ mount[:, :3] for one in (pose, pose_2))
     turn = (rotation @ _exponential(changed[:3])).T @ first.T @ second
-    speed = first.T @ (motion_2[:3] - motion[:3] - duration * gravity)
-    way = pose_2.to_world(arm) - pose.to_world(arm) - duration * (motion[:3] + 0.5 * duration * gravity)
-    delta = jnp.concatenate([speed - velocity, first.T @ way - position]) - changed[3:]
-    return whitening @ jnp.concatenate([angle_axis(turn[None])[0], delta, motion_2[3:] - motion[3:]])
+    start, end = (one.center + one.rotation.T @ mount[:, 3] for one in (pose, pose_2))
+    fall = duration * times(first.T, gravity)
+    speed = first.T @ (motion_2[:3] - motion[:3]) - fall - velocity
+    way = first.T @ (end - start - duration * motion[:3]) - 0.5 * duration * fall - position
+    delta = jnp.concatenate([speed, way]) - changed[3:]
+    return times(whitening, jnp.concatenate([angle_axis(turn[None])[0], delta, motion_2[3:] - motion[3:]]))
 
 
 def preintegrated(

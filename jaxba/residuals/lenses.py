@@ -12,18 +12,19 @@ from jaxba.problem.residuals import Rows, residual
 
 FOCAL, DISTORTION = 0.01, 0.01
 """Standard deviations of the logarithm of a focal length and of each number of distortion. Source: OpenSfM's defaults
-`exif_focal_sd` and `radial_distortion_k1_sd`. COLMAP's proposal of such priors (pull request 4683) has for a weight of 1
-one pixel, and the distortion that moves one by a pixel."""
+`exif_focal_sd` and `radial_distortion_k1_sd`. COLMAP's proposal of such priors (pull request 4683) was
+tried with one pixel, and with one over the focal length."""
 
 
 @residual
 def lens_bounds(lens, *, low, high, sigma):
     """A soft barrier at bounds of the numbers of a lens, `low` and `high`, in the order of its camera model, over
-    `sigma` (two numbers for each; all of one shape, or one for all).
+    `sigma` (of each, or one for all): two numbers for each.
 
     With d the excess over `sigma`, a smooth hinge `(d + sqrt(d^2 + 1)) / 2`: 1/2 at the bound, d far beyond it, and
     `1 / (4 |d|)` far inside. Take `sigma` much smaller than the interval. Source: Barron 2021, "Squareplus"."""
-    d = jnp.concatenate([(low - lens.numbers) / sigma, (lens.numbers - high) / sigma])
+    excess = jnp.concatenate([low, -high]) - jnp.concatenate([lens.numbers, -lens.numbers])
+    d = (excess.reshape(2, -1) / sigma).ravel()
     root = jnp.sqrt(d * d + 1)
     return jnp.where(d < 0, 0.5 / (root + jnp.abs(d)), 0.5 * (d + root))  # the same number, without cancellation
 

@@ -7,6 +7,7 @@ import functools
 import jax.numpy as jnp
 
 from jaxba.problem.residuals import Residual, residual
+from jaxba.problem.row_value import times
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.rotations import rotation_matrix
 
@@ -23,7 +24,7 @@ def depth(pose, point, image, *, measured, sigma):
 @residual
 def control_point(point, *, position, whitening):
     """A surveyed point: its difference from `position` (3), whitened by a matrix (3, 3) (three numbers)."""
-    return whitening @ (point - position)
+    return times(whitening, point - position)
 
 
 @functools.partial(Residual, unknowns=("point", "point_2"), data=("length", "sigma"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from jaxba.problem.residuals import residual
+from jaxba.problem.row_value import times
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.rotations import angle_axis, left_jacobian_inverse
 
@@ -22,7 +23,7 @@ def gravity(pose, *, direction, up, sigma):
 
     The difference of the unit vectors, whose length is the angle where it is small, over `sigma` (radians; three
     numbers, of which two count). Source: the attitude factors of GTSAM, which have two numbers in the tangent plane."""
-    return (pose.rotation @ up / jnp.linalg.norm(up) - direction / jnp.linalg.norm(direction)) / sigma
+    return (times(pose.rotation, up) / jnp.sqrt(up @ up) - direction / jnp.sqrt(direction @ direction)) / sigma
 
 
 @residual
@@ -33,7 +34,7 @@ def heading(pose, *, azimuth, north, up, sigma):
     Of `north` only the part across `up` counts. Not defined for a camera that looks straight up or down. For
     magnetic azimuths add the declination."""
     east = jnp.cross(north, up)
-    ahead = jnp.cross(up, east) / jnp.linalg.norm(up)
+    ahead = jnp.cross(up, east) / jnp.sqrt(up @ up)
     x, y = pose.rotation[2] @ ahead, pose.rotation[2] @ east
     cos, sin = jnp.cos(azimuth), jnp.sin(azimuth)
     return jnp.arctan2(y * cos - x * sin, x * cos + y * sin) / sigma
@@ -43,7 +44,7 @@ def heading(pose, *, azimuth, north, up, sigma):
 def position(pose, *, position, lever_arm, whitening):
     """A GNSS antenna at `lever_arm` (3) in the camera's frame, measured at `position` (3) in the world: the difference
     whitened by a matrix (3, 3) (three numbers). A lever arm of zeros: the camera's centre."""
-    return whitening @ (pose.to_world(lever_arm) - position)
+    return times(whitening, pose.center + times(pose.rotation.T, lever_arm) - position)
 
 
 @residual
@@ -59,4 +60,4 @@ def relative_pose(pose, pose_2, *, rotation, translation, whitening):
     between = pose_2.between(pose)
     turn = angle_axis((rotation.T @ between.rotation)[None])[0]
     shift = rotation.T @ (between.translation - translation)
-    return whitening @ jnp.concatenate([turn, left_jacobian_inverse(turn[:, None])[..., 0] @ shift])
+    return times(whitening, jnp.concatenate([turn, left_jacobian_inverse(turn[:, None])[..., 0] @ shift]))
