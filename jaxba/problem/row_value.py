@@ -48,8 +48,8 @@ class Pose(NamedTuple):
         return angle_axis((self.rotation @ rotation.T)[None])[0]
 
 
-def times(matrix: Array, vector: Array) -> Array:
-    """The product with a vector, term by term, which XLA fuses with what surrounds it."""
+def times(matrix: Float[AnyArray, "m n"], vector: Float[AnyArray, " n"]) -> Array:
+    """The product with a vector, term by term, which XLA fuses with what surrounds it. Raises IndexError: no matrix."""
     return sum(matrix[:, k] * vector[k] for k in range(len(vector)))  # pyright: ignore[reportReturnType]
 
 
