@@ -1,0 +1,132 @@
+"""Preintegrated measurements of an IMU against fine integration, and a solve that finds motion and biases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import jaxba
+from jaxba import residuals
+from jaxba.problem import geometry
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+BIAS = np.array([0.01, -0.02, 0.015, 0.1, -0.05, 0.08])
+NOISE = {"gyro_noise": 1e-3, "accelerometer_noise": 1e-2, "gyro_walk": 1e-4, "accelerometer_walk": 1e-3}
+MOUNT = np.column_stack([Rotation.from_rotvec([1.3, 0.1, -0.2]).as_matrix(), [0.05, -0.1, 0.02]])
+MOMENTS = np.linspace(0.1003, 1.3003, 5)  # between samples
+
+
+def attitude(t) -> Rotation:
+    """From the IMU to the world."""
+    return Rotation.from_rotvec(np.stack([0.5 * np.sin(2 * t), 0.4 * t, 0.3 * np.cos(3 * t)], axis=-1))
+
+
+def place(t) -> np.ndarray:
+    return np.stack([np.sin(1.5 * t), 0.5 * t**2, 0.3 * np.cos(2 * t)], axis=-1)
+
+
+def velocity(t) -> np.ndarray:
+    return np.stack([1.5 * np.cos(1.5 * t), t, -0.6 * np.sin(2 * t)], axis=-1)
+
+
+def samples(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, angular rates and specific forces, without noise or bias."""
+    t, h = np.arange(0, 1.5, 1 / rate), 1e-4
+    rates = (attitude(t - h).inv() * attitude(t + h)).as_rotvec() / (2 * h)
+    force = (velocity(t + h) - velocity(t - h)) / (2 * h) - GRAVITY
+    return t, rates, attitude(t).inv().apply(force)
+
+
+def test_an_interval_is_that_of_fine_integration():
+    t, rates, forces = samples(200.0)
+    found = residuals.preintegrated(t, rates, forces, MOMENTS, bias=BIAS, **NOISE)
+    start, end = MOMENTS[1:3]
+
+    def rate(time, state):
+        now = lambda x: np.array([np.interp(time, t, column) for column in x.T])
+        rotation = state[:9].reshape(3, 3)
+        turn = np.cross(np.eye(3), now(rates) - BIAS[:3])
+        return np.concatenate([(rotation @ turn).ravel(), rotation @ (now(forces) - BIAS[3:]), state[9:12]])
+
+    whole = solve_ivp(rate, (start, end), np.r_[np.eye(3).ravel(), np.zeros(6)], rtol=1e-9, atol=1e-11, max_step=0.002)
+    truth = whole.y[:, -1]
+    np.testing.assert_allclose(found["rotation"][1], truth[:9].reshape(3, 3), atol=3e-6)
+    np.testing.assert_allclose(found["velocity"][1], truth[9:12], atol=3e-5)
+    np.testing.assert_allclose(found["position"][1], truth[12:], atol=3e-5)
+    assert found["duration"] == pytest.approx(0.3)
+
+
+def test_derivatives_by_the_biases_are_those_of_differences():
+    t, rates, forces = samples(200.0)
+    at = lambda bias: residuals.preintegrated(t, rates, forces, MOMENTS, bias=bias, **NOISE)
+    here, step = at(BIAS), 1e-5
+    for k in range(6):
+        one, other = (at(BIAS + sign * step * np.eye(6)[k]) for sign in (1, -1))
+        turn = Rotation.from_matrix(here["rotation"]).inv()
+        turns = [(turn * Rotation.from_matrix(x["rotation"])).as_rotvec() for x in (one, other)]
+        numbers = [np.hstack([w, x["velocity"], x["position"]]) for w, x in zip(turns, (one, other), strict=True)]
+        np.testing.assert_allclose(here["by_bias"][:, :, k], (numbers[0] - numbers[1]) / (2 * step), atol=1e-7)
+
+
+def test_the_covariance_is_that_of_the_recursion_of_the_paper():
+    """Forster et al. 2017, appendix: eqs. A.7 to A.9, by Euler's rule with short steps."""
+    t, rates, forces = samples(2000.0)
+    found = residuals.preintegrated(t, rates, forces, [t[0], t[600]], **NOISE)["whitening"][0]
+    cross = lambda v: geometry.cross_matrices(v[None])[0]
+    covariance, rotation, dt = np.zeros((9, 9)), np.eye(3), 1 / 2000.0
+    for rate, force in zip(rates[:600], forces[:600], strict=True):
+        turn = Rotation.from_rotvec(rate * dt).as_matrix()
+        a, b = np.eye(9), np.zeros((9, 6))
+        a[:3, :3], a[6:, 3:6] = turn.T, np.eye(3) * dt
+        a[3:6, :3], a[6:, :3] = -rotation @ cross(force) * dt, -0.5 * rotation @ cross(force) * dt**2
+        b[:3, :3], b[3:6, 3:], b[6:, 3:] = np.eye(3) * dt, rotation * dt, 0.5 * rotation * dt**2
+        covariance = a @ covariance @ a.T + b @ np.diag(np.repeat([1e-6, 1e-4], 3) / dt) @ b.T
+        rotation = rotation @ turn
+    np.testing.assert_allclose(found[:9, :9] @ covariance @ found[:9, :9].T, np.eye(9), atol=0.02)
+    np.testing.assert_allclose(np.diag(found)[[9, 12]] ** -2, 0.3 * np.array([1e-4, 1e-3]) ** 2)
+    assert not found[:9, 9:].any()
+
+
+def test_a_solve_finds_poses_velocities_and_biases():
+    """Pixels say nothing about the scale: the IMU does."""
+    rng = np.random.default_rng(0)
+    to_camera = Rotation.from_matrix(MOUNT[:, :3])
+    rotation = (to_camera * attitude(MOMENTS).inv()).as_matrix()
+    center = place(MOMENTS) - attitude(MOMENTS).apply(MOUNT[:, :3].T @ MOUNT[:, 3])
+    bal = geometry.COLMAP_FLIP[:, None] * rotation
+    lens = np.tile([500.0, 0.0, 0.0], (5, 1))
+    cameras = np.hstack([geometry.angle_axis(bal), geometry.translations(bal, center), lens])
+    local = rng.uniform([-2, -2, 4], [2, 2, 8], (40, 3))
+    points = local @ rotation[2] + center[2]
+    camera, point = np.repeat(np.arange(5), 40), np.tile(np.arange(40), 5)
+    truth = jaxba.BundleProblem.create(cameras, points, np.zeros((200, 2)), camera, point)
+    truth = truth.replace(observations=geometry.project(truth))
+    t, rates, forces = samples(500.0)
+    given = residuals.preintegrated(t, rates + BIAS[:3], forces + BIAS[3:], MOMENTS, bias=BIAS + 1e-3, **NOISE)
+    one, two = np.arange(4), np.arange(1, 5)
+    rows = residuals.imu(
+        pose=one, motion=one, pose_2=two, motion_2=two, **given, gravity=GRAVITY[None], mount=MOUNT[None]
+    )
+    moved = truth.cameras.copy()
+    moved[1:, :6] += 0.01 * rng.standard_normal((4, 6))
+    start = truth.replace(cameras=moved, points=1.05 * points + 0.01 * rng.standard_normal(points.shape))
+    start = jaxba.hold(start, poses=[0], numbers=["focal", "distortion"])
+    problem = jaxba.with_residual(start, rows, unknowns={"motion": np.zeros((5, 9))})
+    solution = jaxba.solve(problem, "ceres", jaxba.SolveOptions(max_iterations=100))
+    motion = solution.problem.residuals.blocks[0]
+    np.testing.assert_allclose(motion[:, :3], velocity(MOMENTS), atol=1e-3)
+    np.testing.assert_allclose(motion[:, 3:], np.tile(BIAS, (5, 1)), atol=2e-3)
+    np.testing.assert_allclose(geometry.camera_centers(solution.problem.cameras), center, atol=1e-4)
+    np.testing.assert_allclose(solution.problem.points, points, atol=1e-3)
+
+
+def test_wrong_times_are_one_line():
+    t, rates, forces = samples(200.0)
+    with pytest.raises(ValueError, match="times and moments must ascend"):
+        residuals.preintegrated(t, rates, forces, [0.0, 2.0], **NOISE)
+    with pytest.raises(ValueError, match=r"accelerations must have shape \(300, 3\)"):
+        residuals.preintegrated(t, rates, forces[:-1], MOMENTS, **NOISE)
+    with pytest.raises(ValueError, match="noise and walks must be positive"):
+        residuals.preintegrated(t, rates, forces, MOMENTS, **NOISE | {"gyro_walk": 0.0})
