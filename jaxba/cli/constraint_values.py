@@ -5,7 +5,8 @@ The file is read as text alone: `000010` is a name, and a number where a number 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Container, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,23 @@ from jaxba.problem.losses import Loss
 NAMED = 3
 """Names that a message gives of a longer list."""
 
-PARTS = ("positions", "stddev", "loss", "loss_scale", "align")
-"""Keys of `position_priors`."""
+Record = dict[str, Float[np.ndarray, "..."]]
+"""Numbers of one item of a list, by their names."""
 
 
 def names_of(names: Sequence[str]) -> str:
     """Some names of a list, as text."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
+
+
+def meant(items: Sequence[str], names: Container[str] = ()) -> list[Any]:
+    """What items of the file mean: of each text a name if there is such a one, else an id or a position.
+
+    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules.
+    """
+    plain = lambda one: one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
+    return [int(one) if plain(one) else one for one in items]
 
 
 def parse_items(value: Any, what: str) -> list[str]:
@@ -40,32 +50,65 @@ def parse_items(value: Any, what: str) -> list[str]:
     return items
 
 
-def parse_position_priors(value: Any) -> tuple[list[str], Float[np.ndarray, "2 n 3"], dict[str, Any]]:
-    """The value of `position_priors`: names or ids of images, their positions and standard deviations along x, y and z,
-    and the arguments `loss` and `align` of `with_position_priors`.
+def parse_mapping(value: Any, needed: Sequence[str], others: Sequence[str] = ()) -> dict[str, Any]:
+    """A mapping with all of some keys, and no more than some others. Raises ValueError: something else; one line."""
+    keys = (*needed, *others)
+    if not isinstance(value, dict):
+        raise ValueError(f"must be a mapping with the keys {', '.join(keys)}, not {_written(value)}")
+    unknown = [key for key in value if key not in keys]
+    if unknown:
+        raise ValueError(f"unknown key {_written(unknown[0])}; there are {', '.join(keys)}")
+    if missing := [key for key in needed if key not in value]:
+        raise ValueError(f"{missing[0]!r} is missing")
+    return value
 
-    `stddev` is one number, three (x, y, z), a mapping from each image to one or three, or a list of these in the order
-    of the positions.
+
+def parse_vectors(
+    value: Any, name: str, kind: str, needed: Sequence[str] = (), others: Sequence[str] = ()
+) -> tuple[list[str], Float[np.ndarray, "2 n 3"], Loss]:
+    """A vector of each of some images or points, such as `positions`, its standard deviations along x, y and z, and the
+    loss.
+
+    `stddev` is one number, three (x, y, z), a mapping from each image or point to one or three, or a list of these in
+    the order of the vectors.
 
     Raises:
-        ValueError: something that this cannot be; one line that names the key and the image.
+        ValueError: something that this cannot be; one line that names the key and the image or point.
     """
-    if not isinstance(value, dict):
-        raise ValueError(f"must be a mapping with the keys {', '.join(PARTS)}, not {_written(value)}")
-    unknown = [key for key in value if key not in PARTS]
-    if unknown:
-        raise ValueError(f"unknown key {_written(unknown[0])}; there are {', '.join(PARTS)}")
-    if "positions" not in value:
-        raise ValueError("'positions' is missing")
-    given = value["positions"]
+    parse_mapping(value, [name, *needed], ["stddev", "loss", "loss_scale", *others])
+    given = value[name]
     if not isinstance(given, dict) or not given:
-        raise ValueError(f"positions: must be a mapping from images to [x, y, z], not {_written(given)}")
-    images = parse_items(list(given), "names or ids of images")
-    places = [_numbers(f"positions: {image}", place, "three numbers", (3,)) for image, place in given.items()]
-    stddev = _stddev(value.get("stddev", "1"), images)
-    scale = _numbers("loss_scale", value.get("loss_scale", "1"), "a number", ())
-    loss, align = Loss(value.get("loss", "squared"), float(scale)), _truth("align", value.get("align", "true"))
-    return images, np.stack([places, stddev]), {"loss": loss, "align": align}
+        raise ValueError(f"{name}: must be a mapping from {kind}s to [x, y, z], not {_written(given)}")
+    items = parse_items(list(given), f"names or ids of {kind}s")
+    vectors = [parseparse_numbers(f"{name}: {item}", place, "three numbers", (3,)) for item, place in given.items()]
+    return items, np.stack([vectors, _stddev(value.get("stddev", "1"), items, kind)]), parse_loss(value)
+
+
+def parse_pairs(
+    value: Any, kind: str, numbers: dict[str, tuple[tuple[int, ...], ...]]
+) -> tuple[list[Any], list[Record]]:
+    """A list of mappings, each with two images or points and numbers of given shapes. Raises ValueError: something else;
+    one line."""
+    pairs, found = [], []
+    for at, item in enumerate(value if isinstance(value, list) else [value]):
+        try:
+            parse_mapping(item, [kind, *numbers])
+            pairs.append(parse_items(item[kind], f"two {kind}"))
+            if len(set(pairs[-1])) != 2:
+                raise ValueError(f"{kind}: must be two, not {_written(item[kind])}")
+            what = lambda shapes: " or ".join(str(*shape) if shape else "one" for shape in shapes) + " numbers"
+            found.append({x: parseparse_numbers(x, item[x], what(shapes), *shapes) for x, shapes in numbers.items()})
+            if (found[-1]["stddev"] <= 0).any():
+                raise ValueError(f"stddev: must be positive, not {_written(item['stddev'])}")
+        except ValueError as error:
+            raise ValueError(f"item {at + 1}: {error}") from None
+    return pairs, found
+
+
+def parse_loss(value: dict[str, Any]) -> Loss:
+    """The loss of a mapping. Raises ValueError: there is no such loss; one line."""
+    scale = parseparse_numbers("loss_scale", value.get("loss_scale", "1"), "a number", ())
+    return Loss(value.get("loss", "squared"), float(scale))
 
 
 def _written(value: Any) -> str:
@@ -79,29 +122,29 @@ def _written(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
-def _stddev(value: Any, images: list[str]) -> Float[np.ndarray, "n 3"]:
-    """Standard deviations of each image."""
+def _stddev(value: Any, images: list[str], kind: str) -> Float[np.ndarray, "n 3"]:
+    """Standard deviations of each image or point."""
     if isinstance(value, list) and (len(value) != 3 or any(isinstance(one, list) for one in value)):
         if len(value) != len(images):
-            what = f"must be one number, three, or one or three for each of {len(images)} images"
+            what = f"must be one number, three, or one or three for each of {len(images)} {kind}s"
             raise ValueError(f"stddev: {what}, not {len(value)} values")
         value = dict(zip(images, value, strict=True))
     if not isinstance(value, dict):
-        return np.tile(_deviations("stddev", value), (len(images), 1))
+        return np.tile(parse_deviations("stddev", value), (len(images), 1))
     missing = [image for image in images if image not in value]
     if missing:
         raise ValueError(f"stddev: missing for {names_of(missing)}")
-    return np.stack([_deviations(f"stddev: {image}", value[image]) for image in images])
+    return np.stack([parse_deviations(f"stddev: {image}", value[image]) for image in images])
 
 
-def _deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:
-    numbers = _numbers(where, value, "a positive number, or three", (), (3,))
+def parse_deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:
+    numbers = parse_numbers(where, value, "a positive number, or three", (), (3,))
     if not (numbers > 0).all():
         raise ValueError(f"{where}: must be a positive number, or three, not {_written(value)}")
     return np.broadcast_to(numbers, 3)
 
 
-def _numbers(where: str, value: Any, what: str, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+def parse_numbers(where: str, value: Any, what: str, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Finite numbers, also written as text."""
     single = not isinstance(value, list)
     try:
@@ -115,7 +158,7 @@ def _numbers(where: str, value: Any, what: str, *shapes: tuple[int, ...]) -> Flo
     return numbers
 
 
-def _truth(where: str, value: Any) -> bool:
+def parse_truth(where: str, value: Any) -> bool:
     known = {"true": True, "false": False}
     if not isinstance(value, str) or value.lower() not in known:
         raise ValueError(f"{where}: must be true or false, not {_written(value)}")

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Container
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from jaxba.cli.common import UsageError, counted
-from jaxba.cli.constraint_values import names_of, parse_items, parse_position_priors
-from jaxba.io.notes import report
+from jaxba.cli.common import UsageError
+from jaxba.cli.constraint_values import meant, parse_items
+from jaxba.cli.measurements import MEASURED, with_measured
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
 from jaxba.problem.hold import Gauge, hold, with_gauge
 from jaxba.problem.labels import part_name
-from jaxba.problem.measured import with_position_priors
 from jaxba.settings.configurations import SettingsError, read_file
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
@@ -29,7 +26,7 @@ KEYS = {
     "constant_cameras": "ids of cameras, which images share",
     "constant_extrinsics": "ids of cameras, whose places in their rigs do not move",
     "constant_numbers": "focal, principal_point, distortion or names such as k2",
-    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss, loss_scale and align",
+    **MEASURED,
     "gauge": "free, two-cameras or three-points",
 }
 """Keys of the file, and what they hold."""
@@ -112,50 +109,18 @@ def _read(file: str) -> dict[str, Any]:
     return settings
 
 
-def _meant(items: list[str], names: Container[str] = ()) -> list[Any]:
-    """What items of the file mean: of each text a name if there is such a one, else an id or a position.
-
-    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules.
-    """
-    plain = lambda one: one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
-    return [int(one) if plain(one) else one for one in items]
-
-
 def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: bool) -> BundleProblem:
     labels = problem.labels
     names = frozenset() if labels is None else frozenset(labels.names)
-    if key == "position_priors":
-        return _with_positions(problem, where, value, names, strict)
+    if key in MEASURED:
+        return with_measured(problem, where, key, value, strict)
     items = parse_items(value, KEYS[key])
     if key == "constant_numbers":
         return hold(problem, numbers=items)
     of_images = key in ("constant_poses", "constant_rotations")
-    wanted: Any = "all" if value == "all" else _meant(items, names if of_images else ())
+    wanted: Any = "all" if value == "all" else meant(items, names if of_images else ())
     if labels is not None and wanted != "all":
         other = "point" if key == "constant_points" else "lens"
         wanted = labels.positions("image" if of_images else other, wanted)
     part = key.removeprefix("constant_")
     return hold(problem, **{"lenses" if part == "cameras" else part: wanted})
-
-
-def _with_positions(
-    problem: BundleProblem, where: str, value: Any, names: Container[str], strict: bool
-) -> BundleProblem:
-    """The problem with the positions of its own images; a note says which others there are."""
-    given, (positions, stddev), how = parse_position_priors(value)
-    labels = problem.labels
-    ids = range(problem.num_cameras) if labels is None else set(labels.images.tolist())
-    wanted = _meant(given, names)
-    known = [one in names or one in ids for one in wanted]
-    ours = np.flatnonzero(known)
-    others = [image for image, ok in zip(given, known, strict=True) if not ok]
-    if not len(ours):
-        raise ValueError(f"none of the images is in the problem: {names_of(others) or 'no positions'}")
-    if others:
-        text = f"positions of {counted(len(others), 'image')} that the problem does not have: {names_of(others)}"
-        if strict:
-            raise ValueError(text)
-        report([f"{where}: left out {text}"])
-    images: Any = [wanted[at] for at in ours]
-    at = images if labels is None else labels.positions("image", images).tolist()
-    return with_position_priors(problem, positions[ours], stddev=stddev[ours], images=at, **how)

@@ -46,16 +46,7 @@ def imu(
 
 
 def preintegrated(
-    times: Any,
-    angular_rates: Any,
-    accelerations: Any,
-    moments: Any,
-    *,
-    gyro_noise: float,
-    accelerometer_noise: float,
-    gyro_walk: float,
-    accelerometer_walk: float,
-    bias: Any = (0.0,) * 6,
+    times: Any, angular_rates: Any, accelerations: Any, moments: Any, *, noise: Any, bias: Any = (0.0,) * 6
 ) -> dict[str, Float[np.ndarray, "..."]]:
     """The data of `imu` from samples of an IMU: a row for each pair of successive images.
 
@@ -64,24 +55,21 @@ def preintegrated(
         angular_rates: shape (n, 3), rad/s.
         accelerations: specific forces as an accelerometer measures them (at rest: up), shape (n, 3), m/s^2.
         moments: of the images, ascending, within `times`, shape (m + 1,), seconds.
-        gyro_noise, accelerometer_noise: densities of white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
-        gyro_walk, accelerometer_walk: of the random walk of the biases, rad/s^2/sqrt(Hz) and m/s^3/sqrt(Hz). These four
-            are as in Kalibr's files.
+        noise: as in Kalibr's files, shape (4,): densities of white noise of the gyroscope (rad/s/sqrt(Hz)) and of the
+            accelerometer (m/s^2/sqrt(Hz)), and of the random walks of their biases (the same per second).
         bias: of the gyroscope and the accelerometer, about which the result is linear, shape (6,).
 
     Raises:
-        ValueError: shapes, or times that do not ascend or do not enclose the images; one line.
+        ValueError: shapes, noise that is not positive, or times that do not ascend or enclose the images; one line.
     """
-    t = finite("times", times, (np.size(times),))
-    at = finite("moments", moments, (np.size(moments),))
+    t, at = finite("times", times, (np.size(times),)), finite("moments", moments, (np.size(moments),))
+    bias, deviation = finite("bias", bias, (6,)), np.repeat(finite("noise", noise, (4,)), 3)
     measured = {"angular_rates": angular_rates, "accelerations": accelerations}
-    bias = finite("bias", bias, (6,))
     samples = np.hstack([finite(name, x, (len(t), 3)) for name, x in measured.items()]) - bias
-    densities = finite("noise and walks", [gyro_noise, accelerometer_noise, gyro_walk, accelerometer_walk], (4,))
     if len(at) < 2 or not all((np.diff(x) > 0).all() for x in (t, at)) or at[0] < t[0] or at[-1] > t[-1]:
         raise ValueError("times and moments must ascend, and times begin before and end after the moments")
-    if not (densities > 0).all():
-        raise ValueError("noise and walks must be positive")
+    if not (deviation > 0).all():
+        raise ValueError("noise must be positive")
     # half of an interval is a step at least: a single one would leave the covariance singular
     knots = [np.unique([a, (a + b) / 2, b, *t[(t > a) & (t < b)]]) for a, b in pairwise(at)]
     longest = max(map(len, knots))
@@ -90,14 +78,14 @@ def preintegrated(
     between = np.stack([np.interp(middles, t, column) for column in samples.T], axis=-1)
     with numerics(np.float64):
         by_sample, (rotation, velocity, position) = jax.device_get(_derivatives(between, steps))
-    duration, deviation = np.diff(at), np.repeat(densities, 3)
+    duration = np.diff(at)
     rate = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)  # white noise, averaged over a step
     scaled = by_sample * (np.sqrt(rate)[..., None] * deviation[:6])[:, None]
     whitening = np.zeros((len(duration), 15, 15))
     whitening[:, :9, :9] = np.linalg.inv(np.linalg.cholesky(np.einsum("minc,mjnc->mij", scaled, scaled)))
     whitening[:, range(9, 15), range(9, 15)] = 1 / (deviation[6:] * np.sqrt(duration)[:, None])
     found = {"rotation": rotation, "velocity": velocity, "position": position, "by_bias": -by_sample.sum(axis=2)}
-    return found | {"bias": np.tile(bias, (len(at) - 1, 1)), "duration": duration, "whitening": whitening}
+    return found | {"bias": np.tile(bias, (len(duration), 1)), "duration": duration, "whitening": whitening}
 
 
 def _exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -118,8 +106,7 @@ def _integrated(samples: Float[Array, "n 6"], steps: Float[Array, " n"]) -> tupl
     start = jnp.eye(3), jnp.zeros(3), jnp.zeros(3)
     (rotation, velocity, position), _ = jax.lax.scan(advance, start, (samples, steps))
     turn = jax.lax.stop_gradient(rotation).T @ rotation
-    vector = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return jnp.concatenate([vector, velocity, position]), (rotation, velocity, position)
+    return jnp.concatenate([angle_axis(turn[None])[0], velocity, position]), (rotation, velocity, position)
 
 
 _derivatives = jit(jax.vmap(jax.jacrev(_integrated, has_aux=True)))

@@ -13,7 +13,7 @@ from jaxba.problem import geometry
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 BIAS = np.array([0.01, -0.02, 0.015, 0.1, -0.05, 0.08])
-NOISE = {"gyro_noise": 1e-3, "accelerometer_noise": 1e-2, "gyro_walk": 1e-4, "accelerometer_walk": 1e-3}
+NOISE = [1e-3, 1e-2, 1e-4, 1e-3]
 MOUNT = np.column_stack([Rotation.from_rotvec([1.3, 0.1, -0.2]).as_matrix(), [0.05, -0.1, 0.02]])
 MOMENTS = np.linspace(0.1003, 1.3003, 5)  # between samples
 
@@ -41,7 +41,7 @@ def samples(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_an_interval_is_that_of_fine_integration():
     t, rates, forces = samples(200.0)
-    found = residuals.preintegrated(t, rates, forces, MOMENTS, bias=BIAS, **NOISE)
+    found = residuals.preintegrated(t, rates, forces, MOMENTS, bias=BIAS, noise=NOISE)
     start, end = MOMENTS[1:3]
 
     def rate(time, state):
@@ -60,7 +60,7 @@ def test_an_interval_is_that_of_fine_integration():
 
 def test_derivatives_by_the_biases_are_those_of_differences():
     t, rates, forces = samples(200.0)
-    at = lambda bias: residuals.preintegrated(t, rates, forces, MOMENTS, bias=bias, **NOISE)
+    at = lambda bias: residuals.preintegrated(t, rates, forces, MOMENTS, bias=bias, noise=NOISE)
     here, step = at(BIAS), 1e-5
     for k in range(6):
         one, other = (at(BIAS + sign * step * np.eye(6)[k]) for sign in (1, -1))
@@ -73,7 +73,7 @@ def test_derivatives_by_the_biases_are_those_of_differences():
 def test_the_covariance_is_that_of_the_recursion_of_the_paper():
     """Forster et al. 2017, appendix: eqs. A.7 to A.9, by Euler's rule with short steps."""
     t, rates, forces = samples(2000.0)
-    found = residuals.preintegrated(t, rates, forces, [t[0], t[600]], **NOISE)["whitening"][0]
+    found = residuals.preintegrated(t, rates, forces, [t[0], t[600]], noise=NOISE)["whitening"][0]
     cross = lambda v: geometry.cross_matrices(v[None])[0]
     covariance, rotation, dt = np.zeros((9, 9)), np.eye(3), 1 / 2000.0
     for rate, force in zip(rates[:600], forces[:600], strict=True):
@@ -104,7 +104,7 @@ def test_a_solve_finds_poses_velocities_and_biases():
     truth = jaxba.BundleProblem.create(cameras, points, np.zeros((200, 2)), camera, point)
     truth = truth.replace(observations=geometry.project(truth))
     t, rates, forces = samples(500.0)
-    given = residuals.preintegrated(t, rates + BIAS[:3], forces + BIAS[3:], MOMENTS, bias=BIAS + 1e-3, **NOISE)
+    given = residuals.preintegrated(t, rates + BIAS[:3], forces + BIAS[3:], MOMENTS, bias=BIAS + 1e-3, noise=NOISE)
     one, two = np.arange(4), np.arange(1, 5)
     rows = residuals.imu(
         pose=one, motion=one, pose_2=two, motion_2=two, **given, gravity=GRAVITY[None], mount=MOUNT[None]
@@ -125,8 +125,8 @@ def test_a_solve_finds_poses_velocities_and_biases():
 def test_wrong_times_are_one_line():
     t, rates, forces = samples(200.0)
     with pytest.raises(ValueError, match="times and moments must ascend"):
-        residuals.preintegrated(t, rates, forces, [0.0, 2.0], **NOISE)
+        residuals.preintegrated(t, rates, forces, [0.0, 2.0], noise=NOISE)
     with pytest.raises(ValueError, match=r"accelerations must have shape \(300, 3\)"):
-        residuals.preintegrated(t, rates, forces[:-1], MOMENTS, **NOISE)
-    with pytest.raises(ValueError, match="noise and walks must be positive"):
-        residuals.preintegrated(t, rates, forces, MOMENTS, **NOISE | {"gyro_walk": 0.0})
+        residuals.preintegrated(t, rates, forces[:-1], MOMENTS, noise=NOISE)
+    with pytest.raises(ValueError, match="noise must be positive"):
+        residuals.preintegrated(t, rates, forces, MOMENTS, noise=[1e-3, 1e-2, 0.0, 1e-3])
