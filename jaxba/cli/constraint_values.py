@@ -18,9 +18,6 @@ from jaxba.problem.losses import Loss
 NAMED = 3
 """Names that a message gives of a longer list."""
 
-Record = dict[str, Float[np.ndarray, "..."]]
-"""Numbers of one item of a list, by their names."""
-
 
 def names_of(names: Sequence[str]) -> str:
     """Some names of a list, as text."""
@@ -65,49 +62,42 @@ def parse_mapping(value: Any, needed: Sequence[str], others: Sequence[str] = ())
 
 def parse_vectors(
     value: Any, name: str, kind: str, needed: Sequence[str] = (), others: Sequence[str] = ()
-) -> tuple[list[str], Float[np.ndarray, "2 n 3"], Loss]:
-    """A vector of each of some images or points, such as `positions`, its standard deviations along x, y and z, and the
-    loss.
-
-    `stddev` is one number, three (x, y, z), a mapping from each image or point to one or three, or a list of these in
-    the order of the vectors.
-
-    Raises:
-        ValueError: something that this cannot be; one line that names the key and the image or point.
-    """
+) -> tuple[list[list[str]], dict[str, Any]]:
+    """Images or points, with a vector of each, such as `positions`, and standard deviations along x, y and z: `stddev`
+    is one number, three, a mapping from each image or point to one or three, or a list of these in the order of the
+    vectors. Raises ValueError: something else; one line that names the key and the image or point."""
     parse_mapping(value, [name, *needed], ["stddev", "loss", "loss_scale", *others])
     given = value[name]
     if not isinstance(given, dict) or not given:
         raise ValueError(f"{name}: must be a mapping from {kind}s to [x, y, z], not {_written(given)}")
     items = parse_items(list(given), f"names or ids of {kind}s")
-    vectors = [parseparse_numbers(f"{name}: {item}", place, "three numbers", (3,)) for item, place in given.items()]
-    return items, np.stack([vectors, _stddev(value.get("stddev", "1"), items, kind)]), parse_loss(value)
+    vectors = [parse_numbers(f"{name}: {item}", place, "three numbers", (3,)) for item, place in given.items()]
+    return [[item] for item in items], {name: vectors, "stddev": _stddev(value.get("stddev", "1"), items, kind)}
 
 
 def parse_pairs(
-    value: Any, kind: str, numbers: dict[str, tuple[tuple[int, ...], ...]]
-) -> tuple[list[Any], list[Record]]:
-    """A list of mappings, each with two images or points and numbers of given shapes. Raises ValueError: something else;
+    value: Any, kind: str, shapes: dict[str, tuple[tuple[int, ...], ...]]
+) -> tuple[list[list[str]], dict[str, Any]]:
+    """Pairs of images or points, with numbers of some shapes, from a list of mappings. Raises ValueError: something else;
     one line."""
-    pairs, found = [], []
-    for at, item in enumerate(value if isinstance(value, list) else [value]):
-        try:
-            parse_mapping(item, [kind, *numbers])
-            pairs.append(parse_items(item[kind], f"two {kind}"))
-            if len(set(pairs[-1])) != 2:
-                raise ValueError(f"{kind}: must be two, not {_written(item[kind])}")
-            what = lambda shapes: " or ".join(str(*shape) if shape else "one" for shape in shapes) + " numbers"
-            found.append({x: parseparse_numbers(x, item[x], what(shapes), *shapes) for x, shapes in numbers.items()})
-            if (found[-1]["stddev"] <= 0).any():
-                raise ValueError(f"stddev: must be positive, not {_written(item['stddev'])}")
-        except ValueError as error:
-            raise ValueError(f"item {at + 1}: {error}") from None
-    return pairs, found
+    if not isinstance(value, list) or not value:
+        raise ValueError(f"must be a list of mappings, not {_written(value)}")
+    pairs, columns = [], {name: [] for name in shapes}
+    for item in value:
+        pairs.append(parse_items(parse_mapping(item, [f"{kind}s", *shapes])[f"{kind}s"], f"two {kind}s"))
+        if len(pairs[-1]) != 2 or pairs[-1][0] == pairs[-1][1]:
+            raise ValueError(f"{kind}s: must be two, not {_written(item[f'{kind}s'])}")
+        for name, allowed in shapes.items():
+            what = " or ".join(f"{shape[0]} numbers" if shape else "a number" for shape in allowed)
+            columns[name].append(parse_numbers(f"{', '.join(pairs[-1])}: {name}", item[name], what, *allowed))
+            if name == "stddev" and not (columns[name][-1] > 0).all():
+                raise ValueError(f"{', '.join(pairs[-1])}: stddev: must be positive, not {_written(item[name])}")
+    return pairs, columns
 
 
 def parse_loss(value: dict[str, Any]) -> Loss:
     """The loss of a mapping. Raises ValueError: there is no such loss; one line."""
-    scale = parseparse_numbers("loss_scale", value.get("loss_scale", "1"), "a number", ())
+    scale = parse_numbers("loss_scale", value.get("loss_scale", "1"), "a number", ())
     return Loss(value.get("loss", "squared"), float(scale))
 
 

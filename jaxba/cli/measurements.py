@@ -39,57 +39,59 @@ def with_measured(problem: BundleProblem, where: str, key: str, value: Any, stri
     """
     if key == "depths":
         return _with_depths(problem, where, value, strict)
-    if key == "relative_poses":
-        shapes = {"rotation": ((3,), (4,)), "translation": ((3,),), "stddev": ((2,), (6,))}
-        pairs, found = values.parse_pairs(value, "images", shapes)
-        at, kept = _parts(problem, where, "image", pairs, "relative poses", strict)
-        turns = np.stack([_rotation(found[k]["rotation"]) for k in kept])
-        shifts = np.stack([found[k]["translation"] for k in kept])
-        stddev = np.stack([np.repeat(found[k]["stddev"], 6 // len(found[k]["stddev"])) for k in kept])
-        whitening = np.eye(6) / stddev[:, None]
-        data = {"rotation": turns, "translation": shifts, "whitening": whitening}
-        return with_residual(problem, residuals.relative_pose(pose=at[:, 0], pose_2=at[:, 1], **data))
+    kind, what, loss = "point" if key in ("control_points", "distances") else "image", "pairs", None
     if key == "distances":
-        pairs, found = values.parse_pairs(value, "points", {"length": ((),), "stddev": ((),)})
-        at, kept = _parts(problem, where, "point", pairs, key, strict)
-        length, sigma = (np.array([found[k][name] for k in kept]) for name in ("length", "stddev"))
-        return with_residual(problem, residuals.distance(point=at[:, 0], point_2=at[:, 1], length=length, sigma=sigma))
-    kind, name = "point" if key == "control_points" else "image", "directions" if key == "gravity" else "positions"
-    more = {"gravity": (["up"], []), "position_priors": ([], ["align"])}.get(key, ([], []))
-    items, vectors, loss = values.parse_vectors(value, name, kind, *more)
-    at, kept = _parts(problem, where, kind, [[item] for item in items], name, strict)
-    at, (vectors, stddev) = at[:, 0], vectors[:, kept]
+        items, columns = values.parse_pairs(value, kind, {"length": ((),), "stddev": ((),)})
+    elif key == "relative_poses":
+        shapes = {"rotation": ((3,), (4,)), "translation": ((3,),), "stddev": ((2,),)}
+        items, columns = values.parse_pairs(value, kind, shapes)
+    else:
+        what = "directions" if key == "gravity" else "positions"
+        more = {"gravity": (["up"], []), "position_priors": ([], ["align"])}.get(key, ())
+        items, columns = values.parse_vectors(value, what, kind, *more)
+        loss = values.parse_loss(value)
+    at, kept = _parts(problem, where, kind, items, what, strict)
+    columns = {name: [column[k] for k in kept] for name, column in columns.items()}
+    stddev, of = np.stack(columns["stddev"]), columns.get(what)
     if key == "position_priors":
         align = values.parse_truth("align", value.get("align", "true"))
-        return with_position_priors(problem, vectors, stddev=stddev, images=at.tolist(), loss=loss, align=align)
+        return with_position_priors(problem, of, stddev=stddev, images=at[0].tolist(), loss=loss, align=align)
     if key == "control_points":
-        rows = residuals.control_point(point=at, position=vectors, whitening=np.eye(3) / stddev[:, None])
-    else:
+        rows = residuals.control_point(point=at[0], position=of, whitening=np.eye(3) / stddev[:, None])
+    elif key == "gravity":
         up = values.parse_numbers("up", value["up"], "three numbers", (3,))
-        rows = residuals.gravity(pose=at, direction=vectors, up=up[None], sigma=stddev)
+        rows = residuals.gravity(pose=at[0], direction=of, up=up[None], sigma=stddev)
+    elif key == "distances":
+        rows = residuals.distance(point=at[0], point_2=at[1], length=columns["length"], sigma=stddev)
+    else:
+        from scipy.spatial.transform import Rotation  # imported late, as in geometry.py
+
+        read = lambda x: Rotation.from_quat(np.roll(x, -1)) if len(x) == 4 else Rotation.from_rotvec(x)
+        rotation = np.stack([read(x).as_matrix() for x in columns["rotation"]])
+        whitening = np.eye(6) / np.repeat(stddev, 3, axis=1)[:, None]
+        data = {"rotation": rotation, "translation": columns["translation"], "whitening": whitening}
+        rows = residuals.relative_pose(pose=at[0], pose_2=at[1], **data)
     return with_residual(problem, rows, loss=loss)
 
 
 def _parts(
-    problem: BundleProblem, where: str, kind: Part, rows: list[list[str]], what: str, strict: bool
-) -> tuple[Int[np.ndarray, "kept n"], Int[np.ndarray, " kept"]]:
-    """Images or points of those rows that name no others, and which rows these are."""
+    problem: BundleProblem, where: str, kind: Part, items: list[list[str]], what: str, strict: bool
+) -> tuple[Int[np.ndarray, "n kept"], Int[np.ndarray, " kept"]]:
+    """Images or points of those items that name no others, and which items these are."""
     labels, image = problem.labels, kind == "image"
     names = frozenset(labels.names if labels is not None and image else ())
     ids: Any = range(problem.num_cameras if image else problem.num_points)
     if labels is not None:
         ids = frozenset((labels.images if image else labels.points).tolist())
-    wanted = [values.meant(row, names) for row in rows]
-    known = [[one in names or one in ids for one in row] for row in wanted]
-    kept = np.flatnonzero([all(row) for row in known])
-    pairs = zip(sum(rows, []), sum(known, []), strict=True)
-    others = list(dict.fromkeys(one for one, ok in pairs if not ok))
+    wanted = np.array([values.meant(item, names) for item in items], object)
+    known = np.array([[one in names or one in ids for one in item] for item in wanted])
+    kept, others = np.flatnonzero(known.all(axis=1)), list(dict.fromkeys(np.array(items)[~known]))
     if not len(kept):
-        raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others) or f'no {what}'}")
+        raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others)}")
     _leave_out(where, f"{what} of {counted(len(others), kind)} that the problem does not have", others, strict)
-    flat = sum((wanted[k] for k in kept), [])
-    at = np.array(flat) if labels is None else labels.positions(kind, flat)
-    return at.reshape(len(kept), -1), kept
+    flat = wanted[kept].T.ravel()
+    at = flat.astype(int) if labels is None else labels.positions(kind, flat)
+    return at.reshape(-1, len(kept)), kept
 
 
 def _leave_out(where: str, what: str, names: list[str], strict: bool) -> None:
@@ -114,44 +116,39 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
     """
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
     folder, loss = Path(where.rpartition(": ")[0]).parent / str(value["folder"]), values.parse_loss(value)
-    (relative, *_) = values.parse_deviations("stddev", value["stddev"])
+    relative = values.parse_deviations("stddev", value["stddev"])[0]
     names = list(map(str, range(problem.num_cameras))) if problem.labels is None else problem.labels.names
-    measured, missing, ahead = np.full(problem.num_observations, np.nan), [], geometry.depths(problem)
-    camera, scales = np.asarray(problem.camera_index), np.ones(problem.num_cameras)
-    for at, name in enumerate(names):
-        own = np.flatnonzero(camera == at)
-        files = [x for x in (folder / f"{name}.npy", (folder / name).with_suffix(".npy")) if x.is_file()]
-        if not files:
-            missing.append(name)
-            continue
-        pixels = np.asarray(problem.observations)[own]
-        measured[own] = _looked_up(files[0], pixels, centred=every_lens(problem).all_bal)
-        if (good := own[np.isfinite(measured[own])]).size:
-            scales[at] = 1 / np.median(ahead[good] / measured[good])
+    files = [
+        next((x for x in (folder / f"{n}.npy", (folder / n).with_suffix(".npy")) if x.is_file()), None) for n in names
+    ]
+    missing = [name for name, file in zip(names, files, strict=True) if file is None]
     _leave_out(where, f"{counted(len(missing), 'image')} without a map", missing, strict)
+    camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)
+    for at, file in enumerate(files):
+        if file is not None:
+            own = np.flatnonzero(camera == at)
+            measured[own] = _looked_up(file, np.asarray(problem.observations)[own], centred=every_lens(problem).all_bal)
     kept = np.flatnonzero(np.isfinite(measured))
     if not len(kept):
         raise ValueError(f"{folder}: no map has a depth at a pixel of the problem")
     images, image = np.unique(camera[kept], return_inverse=True)
+    measured, ratio = measured[kept], measured[kept] / geometry.depths(problem)[kept]
+    start = [[np.median(ratio[image == k]), 0.0] for k in range(len(images))]
     index = {"pose": camera[kept], "point": np.asarray(problem.point_index)[kept], "image": image}
-    rows = residuals.depth(**index, measured=measured[kept], sigma=relative * measured[kept])
-    start = np.stack([scales[images], np.zeros(len(images))], axis=1)
+    rows = residuals.depth(**index, measured=measured, sigma=relative * measured)
     return with_residual(problem, rows, loss=loss, unknowns={"image": start})
 
 
 def _looked_up(file: Path, pixels: Float[np.ndarray, "n 2"], *, centred: bool) -> Float[np.ndarray, " n"]:
-    """Depths of a map at pixels, whose origin is the upper left corner, or its middle with y upwards; NaN where there
-    is none."""
+    """Depths of a map at pixels from its upper left corner, or its middle with y upwards; NaN where there is none."""
     try:
         depths = np.asarray(np.load(file, allow_pickle=False), np.float64)
+        height, width = depths.shape
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{file}: {reason(error)}") from None
-    if depths.ndim != 2:
-        raise ValueError(f"{file}: must be a matrix of depths, not an array of shape {depths.shape}")
-    height, width = depths.shape
+        raise ValueError(f"{file}: no matrix of depths: {reason(error)}") from None
     if centred:
         pixels = pixels * [1, -1] + [width / 2, height / 2]
     column, row = np.floor(pixels).astype(int).T
-    found = depths[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    found = depths[np.where(inside, row, 0), np.where(inside, column, 0)]
     return np.where(inside & (found > 0) & np.isfinite(found), found, np.nan)
