@@ -78,8 +78,7 @@ def parse_vectors(
 def parse_pairs(
     value: Any, kind: str, shapes: dict[str, tuple[tuple[int, ...], ...]]
 ) -> tuple[list[list[str]], dict[str, Any]]:
-    """Pairs of images or points, with numbers of some shapes, from a list of mappings. Raises ValueError: something else;
-    one line."""
+    """A list of pairs of images or points, and numbers of some shapes. Raises ValueError: something else; one line."""
     if not isinstance(value, list) or not value:
         raise ValueError(f"must be a list of mappings, not {_written(value)}")
     pairs, columns = [], {name: [] for name in shapes}

@@ -80,9 +80,8 @@ def _parts(
     """Images or points of those items that name no others, and which items these are."""
     labels, image = problem.labels, kind == "image"
     names = frozenset(labels.names if labels is not None and image else ())
-    ids: Any = range(problem.num_cameras if image else problem.num_points)
-    if labels is not None:
-        ids = frozenset((labels.images if image else labels.points).tolist())
+    count = problem.num_cameras if image else problem.num_points
+    ids = set(range(count) if labels is None else (labels.images if image else labels.points).tolist())
     wanted = np.array([values.meant(item, names) for item in items], object)
     known = np.array([[one in names or one in ids for one in item] for item in wanted])
     kept, others = np.flatnonzero(known.all(axis=1)), list(dict.fromkeys(np.array(items)[~known]))

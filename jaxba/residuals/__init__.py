@@ -5,10 +5,9 @@ scene units and in the frame that the problem has when the rows are registered, 
 cameras' axes those of COLMAP (`jaxba.problem.row_value.Pose`).
 """
 
-from jaxba.residuals.imu import imu, preintegrated
-from jaxba.residuals.lenses import lens_bounds, lens_default, lens_defaults
-from jaxba.residuals.points import control_point, depth, distance, point_to_plane, rolling_shutter
-from jaxba.residuals.poses import baseline, gravity, heading, position, relative_pose
+from jaxba.residuals.geometry import baseline, control_point, distance, gravity, heading, point_to_plane, position
+from jaxba.residuals.images import depth, lens_bounds, lens_default, lens_defaults, rolling_shutter
+from jaxba.residuals.motion import imu, preintegrated, relative_pose
 
 __all__ = ["baseline", "control_point", "depth", "distance", "gravity", "heading", "imu", "lens_bounds"]
 __all__ += ["lens_default", "lens_defaults", "point_to_plane", "position", "preintegrated", "relative_pose"]

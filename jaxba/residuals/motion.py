@@ -1,6 +1,6 @@
-"""Measurements of an inertial measurement unit (IMU) between images, integrated once for all solves.
+"""Residuals of motion between images: relative poses, and inertial measurement units (IMU), integrated beforehand.
 
-Source: Forster et al. 2017, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", with the midpoint rule
+Source for an IMU: Forster et al. 2017, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", with the midpoint rule
 instead of Euler's, measurements interpolated between samples, and derivatives by JAX.
 """
 
@@ -18,9 +18,24 @@ from jaxtyping import Float
 from jaxba.problem.checks import finite
 from jaxba.problem.residuals import residual
 from jaxba.problem.row_value import times
-from jaxba.rotations import angle_axis, rotation_matrix
+from jaxba.rotations import angle_axis, left_jacobian_inverse, rotation_matrix
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
+
+
+@residual
+def relative_pose(pose, pose_2, *, rotation, translation, whitening):
+    """Odometry or a loop closure: the pose of the second camera in the frame of the first, `P_1 = rotation P_2 +
+    translation`, so that `translation` (3) is the second one's centre seen by the first.
+
+    With Z this measurement and T the poses from camera to world, the logarithm in SE(3) of `Z^-1 T_1^-1 T_2`: a
+    rotation w (radians), then a translation, in the measured frame of the second camera, whitened by a matrix (6, 6).
+    This is the error of GTSAM's BetweenFactorPose3. g2o's EDGE_SE3:QUAT has the translation first, `V(w)` times this
+    one, then the vector part of a quaternion, nearly w / 2. Source: Sola et al. 2018, "A micro Lie theory", eq. 172."""
+    between = pose_2.between(pose)
+    turn = angle_axis((rotation.T @ between.rotation)[None])[0]
+    shift = rotation.T @ (between.translation - translation)
+    return times(whitening, jnp.concatenate([turn, left_jacobian_inverse(turn[:, None])[..., 0] @ shift]))
 
 
 @residual
@@ -28,7 +43,7 @@ def imu(
     pose, motion, pose_2, motion_2, *, rotation, velocity, position, by_bias, bias, duration, whitening, gravity, mount
 ):
     """What an IMU measured between two images, and the random walk of its biases (fifteen numbers: rotation, velocity,
-    position, bias of the gyroscope, bias of the accelerometer; Forster et al. 2017, eqs. 44, 45 and 48).
+    position, biases of gyroscope and accelerometer; Forster et al. 2017, eqs. 44, 45 and 48).
 
     The block `motion` has nine numbers of each image: velocity of the IMU in the world, and the biases. `preintegrated`
     makes the data up to `whitening`, for image after image. `gravity` (3) is in the world, such as (0, 0, -9.81).

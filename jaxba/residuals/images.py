@@ -1,0 +1,64 @@
+"""Residuals of images and lenses: depth maps, a rolling shutter, and bounds and a weak prior of lenses."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.hold import every_lens, number_columns
+from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.residuals import Rows, residual
+from jaxba.rotations import rotation_matrix
+
+FOCAL, DISTORTION = 0.01, 0.01
+"""Standard deviations of the logarithm of a focal length and of each number of distortion. Source: OpenSfM's
+`exif_focal_sd` and `radial_distortion_k1_sd`; COLMAP's pull request 4683 tries one pixel, and 1 / focal length."""
+
+
+@residual
+def depth(pose, point, image, *, measured, sigma):
+    """A depth map at the pixel of a point: `scale z + shift - measured` over `sigma` (one number), with scale and shift
+    of each image in the block `image`; (1, 0) is a metric one. Source: Ranftl et al. 2020, "MiDaS", eq. 4."""
+    return (image[0] * pose.to_camera(point)[2] + image[1] - measured) / sigma
+
+
+@residual
+def rolling_shutter(pose, lens, point, velocity, *, pixel, time, sigma):
+    """The pixel of a point `time` (seconds) after the moment of the pose, less `pixel` (2, as
+    `BundleProblem.observations`), over `sigma` (two numbers). It stands for that observation: give it no weight.
+
+    The block `velocity` has for each image the angular velocity in the camera's frame, as a gyroscope there measures it
+    (rad/s), and the linear one in the world (scene units/s): `P = exp(-time w) (R (X - time v) + t)`. Source: Hedborg
+    et al. 2012, "Rolling Shutter Bundle Adjustment", with constant velocities instead of interpolated poses."""
+    turn = rotation_matrix(-time * velocity[:3, None])[..., 0]
+    return (lens.project(turn @ pose.to_camera(point - time * velocity[3:])) - pixel) / sigma
+
+
+@residual
+def lens_bounds(lens, *, low, high, sigma):
+    """A soft barrier at bounds of the numbers of a lens, in the order of its camera model: of the excess d over `sigma`
+    a smooth hinge `(d + sqrt(d^2 + 1)) / 2`, 1/2 at a bound, d far beyond it and `1 / (4 |d|)` far inside (two numbers
+    for each). Take `sigma` much smaller than the interval. Source: Barron 2021, "Squareplus"."""
+    excess = jnp.concatenate([low, -high]) - jnp.concatenate([lens.numbers, -lens.numbers])
+    d = (excess.reshape(2, -1) / sigma).ravel()
+    root = jnp.sqrt(d * d + 1)
+    return jnp.where(d < 0, 0.5 / (root + jnp.abs(d)), 0.5 * (d + root))  # the same number, without cancellation
+
+
+@residual
+def lens_default(lens, *, expected, weight, relative):
+    """Differences of the numbers of a lens from expected ones, of their logarithms where `relative` is 1, times a
+    `weight` (one number each)."""
+    ratio = jnp.where(relative > 0, lens.numbers / jnp.where(relative > 0, expected, 1), 1)
+    return weight * jnp.where(relative > 0, jnp.log(ratio), lens.numbers - expected)
+
+
+def lens_defaults(problem: BundleProblem, *, focal: float = FOCAL, distortion: float = DISTORTION) -> Rows:
+    """Rows of `lens_default` for all lenses of a problem that is to be solved: focal lengths are as they are now, with
+    a standard deviation of their logarithms, and distortion is zero, with one for each of its numbers."""
+    lenses = every_lens(problem)
+    used, first = np.unique(lenses.index, return_index=True)
+    long, bent = (number_columns(lenses, [name])[used] for name in ("focal", "distortion"))
+    expected = np.where(long, np.asarray(problem.cameras)[first, POSE_SIZE:], 0.0)
+    return lens_default(lens=used, expected=expected, weight=long / focal + bent / distortion, relative=long)
