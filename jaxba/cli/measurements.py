@@ -99,15 +99,6 @@ def _leave_out(where: str, what: str, names: list[str], strict: bool) -> None:
     report([f"{where}: left out {what}: {values.names_of(names)}"] if names else [])
 
 
-def _rotation(given: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3 3"]:
-    """Of an angle-axis vector, or a quaternion wxyz."""
-    from scipy.spatial.transform import Rotation  # imported late, as in geometry.py
-
-    if not given.any() and len(given) == 4:
-        raise ValueError("rotation: the quaternion is zero")
-    return (Rotation.from_rotvec(given) if len(given) == 3 else Rotation.from_quat(np.roll(given, -1))).as_matrix()
-
-
 def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -> BundleProblem:
     """Depths from maps of the size of their images, each with a scale, at first the median, and a shift, at first 0.
 

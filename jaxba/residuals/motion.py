@@ -1,7 +1,7 @@
 """Residuals of motion between images: relative poses, and inertial measurement units (IMU), integrated beforehand.
 
-Source for an IMU: Forster et al. 2017, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", with the midpoint rule
-instead of Euler's, measurements interpolated between samples, and derivatives by JAX.
+Source for IMUs: Forster et al. 2017, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", with the
+midpoint rule instead of Euler's, measurements interpolated between samples, and derivatives by JAX.
 """
 
 from __future__ import annotations
