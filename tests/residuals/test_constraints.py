@@ -39,7 +39,7 @@ def said(tmp_path, problem):
 def data(problem: jaxba.BundleProblem) -> tuple[list[list[int]], dict[str, np.ndarray]]:
     """Indices and data of the only rows."""
     (rows,) = problem.residuals.rows
-    return [x.tolist() for x in rows.index], dict(zip(rows.residual.data, rows.data, strict=True))
+    return [x.tolist() for x in rows.index], dict(zip(rows.residual.data, map(np.asarray, rows.data), strict=True))
 
 
 def test_control_points_are_rows_of_points_by_id(said):

@@ -45,7 +45,9 @@ def centers(problem: jaxba.BundleProblem) -> np.ndarray:
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
-    return Pose(jnp.asarray(Rotation.random(random_state=rng).as_matrix()), jnp.asarray(rng.standard_normal(3)))
+    return Pose(
+        jnp.asarray(Rotation.from_rotvec(rng.standard_normal(3)).as_matrix()), jnp.asarray(rng.standard_normal(3))
+    )
 
 
 def to_world(pose: Pose) -> np.ndarray:
