@@ -19,7 +19,7 @@ FOCAL, DISTORTION = 0.01, 0.01
 @residual
 def depth(pose, point, image, *, measured, sigma):
     """A depth map at the pixel of a point: `scale z + shift - measured` over `sigma` (one number), with scale and shift
-    of each image in the block `image`, (1, 0) if metric. Source: Ranftl et al. 2020, "MiDaS", eq. 4, for inverse depths."""
+    of each image in the block `image`, (1, 0) if metric. Source: Ranftl et al. 2020, "MiDaS", eq. 4 (for inverses)."""
     return (image[0] * pose.to_camera(point)[2] + image[1] - measured) / sigma
 
 
