@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax.numpy as jnp
 
-from jaxba.problem.residuals import Residual, residual
+from jaxba.problem.residuals import residual
 from jaxba.problem.row_value import times
 from jaxba.problem.safe_math import safe_sqrt
 
@@ -17,7 +15,7 @@ def control_point(point, *, position, whitening):
     return times(whitening, point - position)
 
 
-@functools.partial(Residual, unknowns=("point", "point_2"), data=("length", "sigma"))
+@residual
 def distance(point, point_2, *, length, sigma):
     """A scale bar: the distance between two points less `length`, over `sigma` (one number)."""
     return (safe_sqrt(jnp.sum((point_2 - point) ** 2)) - length) / sigma

@@ -56,6 +56,14 @@ def test_control_points_are_rows_of_points_by_id(said):
         said(text, strict=True)
 
 
+def test_a_scale_bar_scales_a_scene_that_has_no_scale(said):
+    item = "points: [100, 101], stddev: 0.001, length: 3"
+    found = said(f"distances:\n- {{{item}}}\n- {{points: [100, 129], stddev: 0.001, length: 4}}\n")
+    assert data(found)[0] == [[0, 0], [1, 29]]
+    points = jaxba.solve(found, options=jaxba.SolveOptions(max_iterations=20)).problem.points
+    assert np.linalg.norm(points[0] - points[1]) == pytest.approx(3, abs=1e-3)
+
+
 def test_directions_of_gravity_are_rows_of_images_by_name_or_id(said):
     found = said("gravity: {up: [0, 1, 0], directions: {view1.jpg: [0, -1, 0], 3: [0, -9, 1]}, stddev: 0.02}\n")
     index, of = data(found)
