@@ -23,6 +23,7 @@ from jax import monitoring
 from jax.experimental.compilation_cache import compilation_cache
 from support import solve
 
+import jaxba
 from jaxba import Loss, Tolerances, make_policy, register_pytree
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
@@ -273,6 +274,21 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
 )
 def test_programs_with_code_of_other_packages_are_not_stored(function, static, argument, folder):
     assert executable_cache.ExecutableCache(folder).path_for(function, static, (argument,)) is None
+
+
+def test_a_users_residual_is_known_by_what_it_does(folder):
+    def registered(scale: float) -> jaxba.BundleProblem:
+        @jaxba.residual
+        def near(point, *, at):
+            return scale * (point - at)
+
+        return jaxba.with_residual(support.tiny(), near(point=[0, 1], at=0.0))
+
+    path = lambda scale: executable_cache.ExecutableCache(folder).path_for(try_step, {}, (registered(scale).residuals,))
+    assert path(1.0) is not None
+    assert path(1.0) == path(1.0) != path(2.0)
+    unregistered = jaxba.residual(lambda point, *, at: point - at)(point=[0], at=0.0)
+    assert executable_cache.ExecutableCache(folder).path_for(try_step, {}, (unregistered,)) is None
 
 
 def test_two_rules_of_a_user_are_not_confused(folder):
