@@ -16,7 +16,7 @@ from jaxba.problem.facing import NAMED, views_behind, without_views_of
 from jaxba.problem.labels import part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
-from jaxba.problem.preprocess import MIN_TRACK
+from jaxba.problem.preprocess import MIN_TRACK, observed
 from jaxba.results.retriangulate import Retriangulation
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
@@ -110,9 +110,12 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     # COLMAP prints the root of the cost over the number of residuals
     colmaps = [np.sqrt(cost / (2 * problem.num_observations)) for cost in (solution.initial_cost, solution.final_cost)]
     as_colmap = f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px" if problem.labels is not None else ""
+    kinds = solution.costs.items() if problem.residuals else ()
+    by_kind = [f"of it at the end: {', '.join(f'{name} {cost:.6e}' for name, cost in kinds)}"] if kinds else []
     lines = [
         f"{state}: {solution.termination.reason}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
+        *by_kind,
         f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
         f"linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
@@ -176,17 +179,20 @@ def padding(problem: BundleProblem, solution: Solution) -> str:
 
 
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
-    """Notes on the data: cameras and points without observations, points with one, points behind cameras."""
-    cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
+    """Notes on the data: cameras and points without observations, points with one, points behind cameras. Rows of other
+    residuals count as observations."""
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
-    alone = cameras == 0
+    for own in (own for rows in problem.residuals.rows for own in rows.points):
+        points += np.bincount(own[own >= 0], minlength=problem.num_points)
+    cameras, _ = observed(problem)
+    alone = ~cameras
     alone[solution.set_aside] = False
     if problem.constants is not None:  # no surprise that these stay
         alone &= ~np.asarray(problem.constants.poses).all(axis=1)
         points = np.where(problem.constants.points, MIN_TRACK, points)
     if problem.rigs is not None:  # others move with their frame
         frame = np.asarray(problem.rigs.frame)
-        alone = alone & ~np.isin(frame, frame[cameras > 0])
+        alone = alone & ~np.isin(frame, frame[cameras])
     before, after = (views_behind(p) for p in (problem, solution.problem))
     found = [
         (int(np.sum(alone)), "camera", "without observations; poses stay as they are"),

@@ -20,7 +20,6 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
 from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residuals, Rows, with_rows
 from jaxba.runtime.compilation import program
-from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 from jaxba.structure.agreement import ALONE
 from jaxba.structure.residual_slots import ResidualSlots, laid_out, residual_slots
@@ -70,7 +69,7 @@ def costs_by_kind(problem: BundleProblem) -> dict[str, float]:
     with numerics(np.float64):
         kinds, of, at = _rows_of(problem)
         for kind in kinds:
-            costs = row_costs(kind.rows, jit(model.values)(kind, of, *at))
+            costs = row_costs(kind.rows, program(model.values, level="quick")(kind, of, *at))
             name = kind.rows.residual.name
             found[name] = found.get(name, 0.0) + float(jnp.sum(costs))
     return found

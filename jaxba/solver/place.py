@@ -47,7 +47,8 @@ class Placed(NamedTuple):
         far = self.offset.any()
         problem = shift(self.counted, -self.offset) if far else self.counted
         points = np.array(problem.points, np.float64)
-        seen = np.flatnonzero(layout.camera_seen[: problem.num_cameras])  # others pad, or stand for rows of residuals
+        # others pad, or stand for rows of residuals
+        seen = np.flatnonzero(np.asarray(layout.camera_seen)[: problem.num_cameras])
         cameras = np.array(self.here.cameras, np.float64)[: problem.num_cameras]
         cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
         lenses, rigs, residuals = problem.lenses, problem.rigs, self.counted.residuals

@@ -89,6 +89,7 @@ def test_the_covariance_is_that_of_the_recursion_of_the_paper():
     assert not found[:9, 9:].any()
 
 
+@pytest.mark.slow
 def test_a_solve_finds_poses_velocities_and_biases():
     """Pixels say nothing about the scale: the IMU does."""
     rng = np.random.default_rng(0)

@@ -97,6 +97,7 @@ def test_inclinometer_and_compass_measure_angles():
     assert np.linalg.norm(of(turned.apply(measured))) == pytest.approx(0.1, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_survey_finds_the_scene_from_points_antennas_baselines_and_planes():
     """Without pixels that say anything about position, orientation and scale of the whole."""
     truth, start = truth_and_start(0.005)

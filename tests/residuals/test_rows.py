@@ -192,7 +192,7 @@ def whole(problem: jaxba.BundleProblem, rows) -> tuple[np.ndarray, object]:
     return np.concatenate([np.ravel(x) for x in parts]), residuals
 
 
-QUICK = ("depth", "drift", "apart")
+QUICK = ("depth", "apart")
 SLOW = [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow, id=what) for kind, what in KINDS.items()]
 
 
