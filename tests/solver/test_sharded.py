@@ -215,9 +215,9 @@ def start_two(file, *options: str, stderr: int = subprocess.STDOUT) -> list[subp
     return [start(k) for k in range(2)]
 
 
-def run_two(file, output) -> tuple[list[int], list[str]]:
+def run_two(file, output, *options: str) -> tuple[list[int], list[str]]:
     """Exit statuses of two processes that solve a file, and what they print."""
-    started = start_two(file, "--policy", "ceres", "--max-iterations", "4", "--output", str(output))
+    started = start_two(file, "--policy", "ceres", "--max-iterations", "4", "--output", str(output), *options)
     try:
         printed = [process.communicate(timeout=240)[0].decode() for process in started]
     finally:
@@ -229,15 +229,19 @@ def run_two(file, output) -> tuple[list[int], list[str]]:
 @pytest.mark.slow
 def test_two_processes_solve_as_one_and_end_together(tmp_path):
     file = tmp_path / "scene.txt"
-    jaxba.write_problem(sequence(), file)
+    problem = sequence()
+    jaxba.write_problem(problem, file)
     statuses, printed = run_two(file, tmp_path / "nowhere" / "out.txt")
     assert statuses == [2, 2]
     assert "nowhere" in printed[0]
-    statuses, printed = run_two(file, tmp_path / "out.txt")
+    (tmp_path / "more.yaml").write_text("distances: [{points: [0, 9], length: 2, stddev: 0.1}]\n")
+    statuses, printed = run_two(file, tmp_path / "out.txt", "--constraints", str(tmp_path / "more.yaml"))
     assert statuses == [0, 0], printed
     assert "4 iterations" in printed[0]
     assert {line for line in printed[1].splitlines() if not line.startswith("[Gloo]")} <= {WAITING}  # Gloo is C++
-    one = solve(sequence(), "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).final_cost
+    bars = jaxba.residuals.distance(point=0, point_2=9, length=2.0, sigma=0.1)
+    problem = jaxba.with_residual(jaxba.read_problem(file), bars)
+    one = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).costs["pixels"]
     np.testing.assert_allclose(geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9)
 
 
