@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxba.model import row_derivatives as model
 from jaxba.model.residuals import row_costs
@@ -66,13 +67,17 @@ def with_residual(
 def costs_by_kind(problem: BundleProblem) -> dict[str, float]:
     """The cost of each residual besides those of pixels, by the name of its function."""
     found: dict[str, float] = {}
+    for rows, costs in zip(problem.residuals.rows, costs_of_rows(problem), strict=True):
+        found[rows.residual.name] = found.get(rows.residual.name, 0.0) + float(np.sum(costs))
+    return found
+
+
+def costs_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, " rows"]]:
+    """The cost of every row of `problem.residuals.rows`."""
     with numerics(np.float64):
         kinds, of, at = _rows_of(problem)
-        for kind in kinds:
-            costs = row_costs(kind.rows, program(model.values, level="quick")(kind, of, *at))
-            name = kind.rows.residual.name
-            found[name] = found.get(name, 0.0) + float(jnp.sum(costs))
-    return found
+        values = program(model.values, level="quick")
+        return [np.asarray(row_costs(kind.rows, values(kind, of, *at))) for kind in kinds]
 
 
 def _rows_of(problem: BundleProblem) -> tuple[tuple[ResidualSlots, ...], Unknowns, tuple[jax.Array, jax.Array]]:

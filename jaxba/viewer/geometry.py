@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.camera_models import BAL
-from jaxba.problem.geometry import COLMAP_FLIP, camera_poses
+from jaxba.problem.geometry import COLMAP_FLIP, camera_centers, camera_poses
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity
 
 WIDEST = 2.0
@@ -126,3 +127,15 @@ def residual_segments(
     cameras = np.full(len(own), camera)
     ends = [frusta.on_plane(place, cameras) for place in (pixels, pixels - share * difference)]
     return np.stack(ends, axis=1), float(factor)
+
+
+def row_segments(problem: BundleProblem) -> list[Float[np.ndarray, "segments 2 3"]]:
+    """For each residual besides those of pixels the segments between the two cameras or points that its rows have."""
+    centers, points, found = camera_centers(problem.cameras), np.asarray(problem.points), []
+    groups = block_groups(problem)
+    for rows in problem.residuals.rows:
+        owners = owners_of(problem, rows, groups)
+        ends = [(places, at) for places, every in ((centers, owners.cameras), (points, owners.points)) for at in every]
+        ends = [places[at] for places, at in ends if (at >= 0).all()]
+        found.append(np.stack(ends[:2], axis=1) if len(ends) > 1 else np.zeros((0, 2, 3)))
+    return found

@@ -13,12 +13,13 @@ from io import StringIO
 
 import numpy as np
 
+from jaxba.model.registration import costs_of_rows
 from jaxba.viewer import geometry
 from jaxba.viewer.curve import add_curve, colour_of, curve_of
 from jaxba.viewer.extra import viser
 from jaxba.viewer.recording import Recording
 from jaxba.viewer.sources import Shown
-from jaxba.viewer.stage import ASIDE, POINT_SIZE, SHOWN_POINTS, Stage
+from jaxba.viewer.stage import ASIDE, KINDS, POINT_SIZE, SHOWN_POINTS, Stage
 
 PORT = 8080
 """First port that is tried."""
@@ -27,8 +28,8 @@ BESIDE = 0.2
 """How far, as a share of the distance, the scene stands beside the middle: the panel is on the right, what a page in a
 file says on the left."""
 
-WORST = 20
-"""Images in the list of the worst."""
+WORST, WORST_ROWS = 20, 5
+"""Images in the list of the worst, and rows of a residual."""
 
 NOTHING = "none"
 
@@ -121,6 +122,8 @@ class Viewer:
         worst = {name: (stage, camera) for stage in self.stages for name, camera in worst_images(stage)}
         picked = gui.add_dropdown("worst images", (NOTHING, *worst))
         self._about = gui.add_markdown("Click on an image, or choose one of the worst.")
+        if rows := [line for stage in self.stages for line in about_rows(stage)]:
+            gui.add_markdown("\n\n".join(rows))
         self._picture = gui.add_image(np.full((1, 1, 3), 255, np.uint8), visible=False)
         self._slider.on_update(lambda _: self._show(iteration=int(self._slider.value)))
         colour.on_update(lambda _: self._show(colour=colour.value))
@@ -207,6 +210,17 @@ def worst_images(stage: Stage, count: int = WORST) -> list[tuple[str, int]]:
         (f"{measures.of_image[camera]:.3g} px: {stage.shown.name_of(camera)} ({measures.seen[camera]:,})", camera)
         for camera in measures.worst()[:count].tolist()
     ]
+
+
+def about_rows(stage: Stage) -> list[str]:
+    """For each residual besides those of pixels its colour, its cost and its worst rows, at the iteration shown."""
+    rows, lines = stage.problem.residuals.rows, []
+    for number, costs in enumerate(costs_of_rows(stage.problem) if rows else ()):
+        worst = ", ".join(f"{row} ({costs[row]:.3g})" for row in np.argsort(-costs, kind="stable")[:WORST_ROWS])
+        colour, name = KINDS[number % len(KINDS)], plain(rows[number].residual.name)
+        cost = f"cost {costs.sum():.5g} of {len(costs):,} rows; the worst: {worst}"
+        lines.append(f'<font color="rgb{colour}">●</font> **{name}**: {cost}')
+    return lines
 
 
 def about_image(stage: Stage, camera: int) -> str:

@@ -20,7 +20,6 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import Labels
-from jaxba.problem.residuals import Residuals
 from jaxba.solver.drivers import IterationRecord
 
 RECORDED_POINTS = 20_000
@@ -86,9 +85,9 @@ def evenly(count: int, limit: int) -> Int[np.ndarray, " kept"]:
 
 
 def of_points(problem: BundleProblem, kept: Int[np.ndarray, " kept"]) -> BundleProblem:
-    """A problem of some of the points and their observations, for looking at: without constants and priors."""
+    """A problem of some of the points, their observations and other rows, for looking at: without constants."""
     labels, none = problem.labels, dict.fromkeys(("whitening", "constants", "rigs"))
-    found = problem.replace(residuals=Residuals(), **none).subset(np.isin(problem.point_index, kept), points=kept)
+    found = problem.replace(**none).subset(np.isin(problem.point_index, kept), points=kept)
     labels = labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept])
     return found.replace(cameras=np.asarray(problem.cameras), labels=labels)
 

@@ -39,6 +39,9 @@ FILE, ERROR, TRACK = "colour of the file", "reprojection error", "track length"
 START, CHOSEN, RESIDUAL = (150, 150, 150), (255, 120, 0), (208, 0, 0)
 """Colours."""
 
+KINDS = ((0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (213, 94, 0))
+"""Colours of residuals besides those of pixels. Source: Okabe and Ito 2008, "Color Universal Design"."""
+
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
@@ -154,6 +157,9 @@ class Stage:
             for camera in layers.frusta.keys() - shown:
                 layers.frusta.pop(camera).remove()
             self._mark(problem, measures, poses)
+            for number, segments in enumerate(geometry.row_segments(problem)):
+                ends = similarity.points(segments.reshape(-1, 3)).reshape(-1, 2, 3)
+                layers.lines(f"rows {number}", ends, KINDS[number % len(KINDS)], 1.0)
             if "start points" not in layers and self.shown.recording.last > 0:
                 self._draw_start()
             self._label(points)

@@ -246,6 +246,31 @@ def test_slider_and_curve_come_with_the_first_iteration(recording):
         viewer.close()
 
 
+def test_residuals_are_segments_of_a_colour_for_each_and_their_worst_rows_are_listed(recording):
+    from jaxba import residuals
+    from jaxba.model.registration import costs_of_rows
+    from jaxba.viewer.page import Viewer, about_rows
+    from jaxba.viewer.sources import shown
+
+    problem = recording.problem
+    bars = residuals.distance(point=[0, 1, 2], point_2=[3, 4, 5], length=[0.0, 50.0, 0.0], sigma=0.1)
+    problem = jaxba.with_residual(problem, bars)
+    ahead = residuals.baseline(pose=[0, 1], pose_2=[1, 2], length=1.0, sigma=0.1)
+    problem = jaxba.with_residual(problem, ahead)
+    viewer = Viewer([shown(problem, "run")])
+    try:
+        (stage,) = viewer.stages
+        drawn = [stage.layers._nodes[f"rows {number}"].points for number in range(2)]
+        assert [len(segments) for segments in drawn] == [3, 2]
+        ends = stage._similarity.points(np.asarray(problem.points))[[1, 4]]
+        np.testing.assert_allclose(drawn[0][1], ends, atol=1e-5)
+        first, second = about_rows(stage)
+        assert f"distance**: cost {costs_of_rows(problem)[0].sum():.5g} of 3 rows; the worst: 1 (" in first
+        assert "rgb(0, 158, 115)" in second
+    finally:
+        viewer.close()
+
+
 def test_the_command_says_what_is_missing(tmp_path, capsys):
     from jaxba.cli.view import run
 
