@@ -213,7 +213,8 @@ def _solve_transposed(
     state = initial_state(layout, solved, options, jnp.float64)
     unknowns, order = layout.unknowns, layout.points
     count, end = state.cameras.shape[1], len(state.cameras) - sum(unknowns.own_sizes)
-    seen, given = jnp.asarray(layout.camera_seen)[:, None], len(inputs.cameras)
+    given = len(inputs.cameras)
+    seen = jnp.asarray(layout.camera_seen)[:, None] & (jnp.arange(count)[:, None] < given)  # others stand for rows
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
         """On the unknowns that a minimum determines, orthogonally."""

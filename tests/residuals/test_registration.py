@@ -181,7 +181,7 @@ def test_invalid_observations_are_dropped_and_residuals_stay():
 
 @pytest.mark.slow
 def test_derivatives_by_the_data_are_those_of_differences():
-    problem = jaxba.hold(example("depth")[0], poses=[0])
+    problem = jaxba.hold(everything(), poses=[0])
     tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15), max_iterations=200)
     solve = jaxba.differentiable_solve(problem, "ceres", tight)
     inputs = jax.tree.map(jnp.asarray, jaxba.inputs_of(problem))
