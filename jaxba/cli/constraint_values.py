@@ -89,8 +89,8 @@ def parse_pairs(
         for name, allowed in shapes.items():
             what = " or ".join(f"{shape[0]} numbers" if shape else "a number" for shape in allowed)
             columns[name].append(parse_numbers(f"{', '.join(pairs[-1])}: {name}", item[name], what, *allowed))
-            if name == "stddev" and not (columns[name][-1] > 0).all():
-                raise ValueError(f"{', '.join(pairs[-1])}: stddev: must be positive, not {_written(item[name])}")
+            if name in ("stddev", "length") and not (columns[name][-1] > 0).all():
+                raise ValueError(f"{', '.join(pairs[-1])}: {name}: must be positive, not {_written(item[name])}")
     return pairs, columns
 
 

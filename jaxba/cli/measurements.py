@@ -51,6 +51,8 @@ def with_measured(problem: BundleProblem, where: str, key: str, value: Any, stri
         items, columns = values.parse_vectors(value, what, kind, *more)
         loss = values.parse_loss(value)
     at, kept = _parts(problem, where, kind, items, what, strict)
+    if (at[:1] == at[1:]).any():
+        raise ValueError(f"a pair has the same {kind} twice")
     columns = {name: [column[k] for k in kept] for name, column in columns.items()}
     stddev, of = np.stack(columns["stddev"]), columns.get(what)
     if key == "position_priors":
@@ -105,7 +107,9 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
     Of a BAL lens, whose pixels do not say where the image is, the principal point is the middle of the map.
     """
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
-    folder, loss = Path(where.rpartition(": ")[0]).parent / str(value["folder"]), values.parse_loss(value)
+    if not isinstance(value["folder"], str):
+        raise ValueError(f"folder: must be a name, not {value['folder']}")
+    folder, loss = Path(where.rpartition(": ")[0]).parent / value["folder"], values.parse_loss(value)
     relative = values.parse_deviations("stddev", value["stddev"])[0]
     names = list(map(str, range(problem.num_cameras))) if problem.labels is None else problem.labels.names
     files = [

@@ -142,6 +142,12 @@ def test_depth_maps_are_looked_up_at_pixels_and_find_their_scales(model, problem
         ("distances: [{points: [100, 101], length: 1}]", "distances: 'stddev' is missing"),
         ("distances: [{points: [100, 100], length: 1, stddev: 1}]", "points: must be two, not [100, 100]"),
         ("distances: [{points: [100, 101], length: 1, stddev: 0}]", "100, 101: stddev: must be positive, not 0"),
+        ("distances: [{points: [100, 101], length: -1, stddev: 1}]", "100, 101: length: must be positive, not -1"),
+        (
+            "relative_poses: [{images: [view0.jpg, 1], rotation: [0, 0, 0], translation: [0, 0, 0], stddev: [1, 1]}]",
+            "relative_poses: a pair has the same image twice",
+        ),
+        ("depths: {folder: [maps], stddev: 1}", "folder: must be a name, not"),
         ("distances: [{points: [100, 101], length: x, stddev: 1}]", "100, 101: length: must be a number, not x"),
         (
             "relative_poses: [{images: [1, 2], rotation: [1, 2], translation: [0, 0, 0], stddev: [1, 1]}]",
