@@ -110,6 +110,8 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
     if not isinstance(value["folder"], str):
         raise ValueError(f"folder: must be a name, not {value['folder']}")
     folder, loss = Path(where.rpartition(": ")[0]).parent / value["folder"], values.parse_loss(value)
+    if not folder.is_dir():
+        raise ValueError(f"folder: there is no folder {folder}")
     relative = values.parse_deviations("stddev", value["stddev"])[0]
     names = list(map(str, range(problem.num_cameras))) if problem.labels is None else problem.labels.names
     files = [

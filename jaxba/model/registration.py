@@ -96,7 +96,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, str]:
     with numerics(np.float64):
         (*_, kind), of, at = _rows_of(problem.replace(residuals=residuals))
         try:
-            traced, result = jax.make_jaxpr(model.values, return_shape=True)(kind, of, *at)
+            values = lambda *given: model.values(*given)  # a new function: an earlier trace may have had other globals
+            traced, result = jax.make_jaxpr(values, return_shape=True)(kind, of, *at)
             shape = result.shape[::-1]
         except Exception as error:
             text = " ".join(str(error).split())
@@ -127,9 +128,17 @@ def _source(traced: Any) -> str:
     if any(word in text for word in ("custom_jvp", "custom_vjp", "callback", "0x")):
         return ""
     digest = hashlib.sha256(text.encode())
-    for constant in traced.consts:
+    for constant in _constants(traced):
         digest.update(np.asarray(constant).tobytes())
     return digest.hexdigest()
+
+
+def _constants(found: Any) -> list[Any]:
+    """All arrays that a traced function holds, also in the functions that it calls."""
+    if isinstance(found, tuple | list):
+        return [x for one in found for x in _constants(one)]
+    equations = getattr(getattr(found, "jaxpr", found), "eqns", ())
+    return [*getattr(found, "consts", ()), *(x for one in equations for x in _constants([*one.params.values()]))]
 
 
 def _examined(kind: ResidualSlots, unknowns: Unknowns, at: Any, change: Any) -> tuple[Any, jax.Array, jax.Array]:

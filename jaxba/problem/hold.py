@@ -86,10 +86,11 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
 
     A cost of pixels alone does not change when the whole scene is moved, turned and scaled. `two-cameras`: the pose of
     the observed camera that is nearest to the middle of all, and one number of the translation of the one that is
-    farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else; where rigs give the
-    scene its scale, the first pose alone. `three-points`: three points that many images see and that are far apart are
-    constant. `free`: no more than is. Nothing becomes constant, with a `ProblemWarning`, where constants and priors fix
-    the seven already. Source: COLMAP, `BundleAdjustmentGauge`.
+    farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else; where rigs or scale
+    bars give the scene its scale, the first pose alone. `three-points`: three points that many images see and that are
+    far apart are constant. `free`: no more than is. Nothing becomes constant, with a `ProblemWarning`, where constants
+    and priors fix the seven already; there is one, too, where more becomes constant than is free. Source: COLMAP,
+    `BundleAdjustmentGauge`.
 
     In a scene far from the origin (`preprocess.FAR`) the number of a translation is that of the scene shifted to it.
 
@@ -107,16 +108,28 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
         note = f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already"
         warnings.warn(note, ProblemWarning, stacklevel=2)
         return problem
-    if scaled:
-        if gauge == "three-points":
-            raise ProblemError("the rigs give the scene its scale: use the gauge of two cameras, which then holds one")
-        seen = _placed(problem)
-        constants.poses[seen[np.argmin(_from_middle(geometry.camera_centers(problem.cameras)[seen]))]] = True
-    elif gauge == "two-cameras":
+    known = fixed_freedoms(problem.replace(constants=None))
+    if scaled and gauge == "three-points":
+        raise ProblemError("the rigs give the scene its scale: use the gauge of two cameras, which then holds one")
+    if known and gauge == "two-cameras":
+        seen, one = _placed(problem), constants_of(constants, problem.num_cameras, problem.num_points)
+        one.poses[seen[np.argmin(_from_middle(geometry.camera_centers(problem.cameras)[seen]))]] = True
+        if scaled or fixed_freedoms(problem.replace(constants=one)) == SIMILARITY:
+            if known > 1:
+                _warn_of_more_than_is_free(known)
+            return _with_constants(problem, one)
+    if known:
+        _warn_of_more_than_is_free(known)
+    if gauge == "two-cameras":
         _fix_two_cameras(problem, constants)
     else:
         _fix_three_points(problem, constants)
     return _with_constants(problem, constants)
+
+
+def _warn_of_more_than_is_free(known: int) -> None:
+    note = f"residuals fix {known} of {SIMILARITY} directions of the scene already: the gauge holds more than is free"
+    warnings.warn(f"{note}; hold poses or points instead", ProblemWarning, stacklevel=3)
 
 
 def _placed(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:

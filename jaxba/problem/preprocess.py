@@ -36,13 +36,15 @@ def normalize(problem: BundleProblem, size: float = SIZE) -> BundleProblem:
         size: new median L1 distance, scene units.
 
     Raises:
-        ProblemError: `size` is not positive, or half of the points coincide.
+        ProblemError: `size` is not positive, there are no points, or half of them coincide.
 
     Source: Ceres `BALProblem::Normalize` (its median is the upper one of an even count).
     """
     if not (np.isfinite(size) and size > 0):
         raise ProblemError(f"the size of a normalised scene must be positive, not {size}")
     points = np.asarray(problem.points, dtype=np.float64)
+    if not len(points):
+        raise ProblemError("the scene has no points to be normalised by")
     middle = _upper_median(points)
     spread = float(_upper_median(np.abs(points - middle).sum(axis=1)))
     if spread == 0:

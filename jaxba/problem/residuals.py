@@ -44,7 +44,7 @@ class Residual:
     data: tuple[str, ...]
     """Names of its keyword-only parameters."""
 
-    source: str = field(default="", compare=False)
+    source: str = ""
     """What determines the computations of the function once it is registered, a digest; empty if nothing does."""
 
     @property
@@ -57,7 +57,7 @@ class Residual:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By name: a problem may be pickled where the decorated function can be imported."""
-        return _imported, (self.function.__module__, self.function.__qualname__)
+        return _imported, (self.function.__module__, self.function.__qualname__, self.source)
 
     def __call__(self, **columns: Any) -> Rows:
         """Rows of the residual.
@@ -90,8 +90,8 @@ class Residual:
         return Rows(tuple(index), tuple(data), residual=self)
 
 
-def _imported(module: str, name: str) -> Residual:
-    return operator.attrgetter(name)(importlib.import_module(module))
+def _imported(module: str, name: str, source: str) -> Residual:
+    return replace(operator.attrgetter(name)(importlib.import_module(module)), source=source)
 
 
 def residual(function: Callable[..., Any]) -> Residual:

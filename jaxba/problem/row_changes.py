@@ -64,7 +64,7 @@ def _changes(
         camera_centers(at).reshape(*shape, 3),
         at[:, POSE_SIZE:].reshape(*shape, -1),
         model,
-        np.asarray(problem.points, np.float64)[np.maximum(np.stack(owners.points, axis=1), 0)],
+        np.vstack([np.asarray(problem.points, np.float64), np.zeros((1, 3))])[np.stack(owners.points, axis=1)],
         *blocks,
         *rows.data,
     )

@@ -111,4 +111,6 @@ def value(
         else:
             arguments.append(block[which])
     found = rows.residual.function(*arguments, **dict(zip(rows.residual.data, data, strict=True)))
+    if jnp.iscomplexobj(found):
+        raise TypeError("it returns complex numbers")
     return jnp.atleast_1d(jnp.asarray(found, dtype))

@@ -110,6 +110,7 @@ def retriangulate_without(
         order, real = layout.points, layout.points < problem.num_points  # without padding points
         first = np.zeros(here.num_points, np.int64)
         first[here.point_index[::-1]] = here.camera_index[::-1]  # the first observation is written last and stays
+        first = np.minimum(first, counted.num_cameras - 1)  # others stand for rows of points, which stay
         origin = np.zeros((3, len(order)))
         centers = geometry.camera_centers(counted.cameras) - offset
         origin[:, real] = centers[first[order[real]]].T

@@ -87,7 +87,8 @@ class Solution(ArrayRecord):
     def costs(self) -> dict[str, float]:
         """The final cost by kind: of `pixels`, and of each other residual by the name of its function; pixels^2."""
         others = costs_by_kind(self.problem)
-        return {PIXELS: self.final_cost - sum(others.values()), **others}
+        pixels = self.final_cost - sum(others.values()) if self.problem.num_observations else 0.0
+        return {PIXELS: pixels, **others}
 
     def plot(self) -> Figure:
         """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""

@@ -62,6 +62,9 @@ def test_a_pose_graph_ends_where_scipy_does():
         logarithm = move - cross / 2 + factor * np.cross(axis, cross)
         return (np.hstack([axis, logarithm]) @ measured["whitening"][0]).ravel()
 
+    assert np.isfinite(jaxba.covariance(solution.problem).poses).all()
+    with pytest.raises(jaxba.ProblemError, match="no points"):
+        jaxba.normalize(problem)
     found = least_squares(errors, poses[1:].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert solution.final_cost == pytest.approx(found.cost, rel=1e-9)
     ends = AXES[:, None] * rotation_matrices(solution.problem.cameras[1:, :3])

@@ -24,6 +24,7 @@ from test_rows import (
 
 import jaxba
 from jaxba.problem import geometry
+from jaxba.residuals import distance
 
 
 @jaxba.residual
@@ -69,6 +70,11 @@ def shared(pose, sensor, *, at):
 @jaxba.residual
 def between_points(pose, point, point_2):
     return pose.to_camera(point) - point_2
+
+
+@jaxba.residual
+def complex_numbers(point):
+    return 1j * point
 
 
 @jaxba.residual
@@ -118,6 +124,7 @@ def refused():
         ),
         "nothing depends": (of(idle(pose=0, point=0, at=1.0)), "residual idle depends on pose in no row"),
         "infinite": (of(logarithm(point=0, at=1e6)), "residual logarithm is not finite at the start in row 0"),
+        "complex": (of(complex_numbers(point=0)), "residual complex_numbers cannot be computed: .*it returns complex"),
         "a matrix": (of(table(point=0)), "residual table must return a number or a vector"),
         "an error": (of(broken(point=0)), "residual broken cannot be computed: .*nothing"),
         "derivative": (of(wrong_derivative(point=0)), "derivatives of residual wrong_derivative do not agree"),
@@ -190,6 +197,34 @@ def test_derivatives_by_the_data_are_those_of_differences():
     (measured, sigma), *rest = inputs.residuals
     at = lambda step: value(inputs._replace(residuals=((measured.at[5].add(step), sigma), *rest)))
     np.testing.assert_allclose(found.residuals[0][0][5], (at(1e-4) - at(-1e-4)) / 2e-4, rtol=5e-3)
+
+
+def test_a_function_whose_globals_have_changed_is_compiled_anew():
+    sigma = [1.0]
+
+    @jaxba.residual
+    def near(point, *, at):
+        return (point - at) / sigma[0]
+
+    problem = scene()
+    rows = near(point=np.arange(5), at=0.0)
+    costs = []
+    for sigma[0] in (1.0, 0.1):
+        solution = jaxba.solve(jaxba.with_residual(problem, rows), "ceres", jaxba.SolveOptions(max_iterations=0))
+        costs.append(solution.costs["near"])
+        assert solution.initial_cost == pytest.approx(sum(solution.costs.values()))
+        pixels = 0.5 * np.sum(geometry.residuals(problem) ** 2)
+        assert solution.costs["pixels"] == pytest.approx(pixels, rel=1e-6)
+    assert costs[1] == pytest.approx(100 * costs[0])
+
+
+def test_a_gauge_holds_no_scale_that_scale_bars_know():
+    problem = jaxba.with_residual(scene(), distance(point=[0, 3], point_2=[7, 8], length=9.0, sigma=0.1))
+    tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-14, 1e-14, 1e-14), max_iterations=300)
+    ends = [jaxba.solve(p, "ceres", tight).final_cost for p in (problem, jaxba.with_gauge(problem, "two-cameras"))]
+    assert ends[1] == pytest.approx(ends[0], rel=1e-8)
+    with pytest.warns(jaxba.ProblemWarning, match="residuals fix 1 of 7 directions of the scene already"):
+        jaxba.with_gauge(problem, "three-points")
 
 
 def test_a_problem_with_residuals_can_be_pickled_and_compared():

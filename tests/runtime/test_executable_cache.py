@@ -284,6 +284,18 @@ def test_a_users_residual_is_known_by_what_it_does(folder):
 
         return jaxba.with_residual(support.tiny(), near(point=[0, 1], at=0.0))
 
+    def jitted(scale: float) -> jaxba.BundleProblem:
+        table = np.arange(3.0) * scale
+        inner = jax.jit(lambda point: point - table)
+
+        @jaxba.residual
+        def near(point, *, at):
+            return inner(point) - at
+
+        return jaxba.with_residual(support.tiny(), near(point=[0, 1], at=0.0))
+
+    known = [jitted(scale).residuals.rows[0].residual.source for scale in (1.0, 1.0, 2.0)]
+    assert known[0] == known[1] != known[2]
     path = lambda scale: executable_cache.ExecutableCache(folder).path_for(try_step, {}, (registered(scale).residuals,))
     assert path(1.0) is not None
     assert path(1.0) == path(1.0) != path(2.0)
