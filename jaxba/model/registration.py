@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +26,9 @@ from jaxba.runtime.numerics import numerics
 from jaxba.structure.agreement import ALONE
 from jaxba.structure.residual_slots import ResidualSlots, laid_out, residual_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
+
+CHECKED_INDICES = "jax_check_static_indices"
+"""A setting of JAX."""
 
 STEP, AGREE = 1e-6, 1e-3
 """Relative step of central differences, and how near they have to be to derivatives, relative to the largest."""
@@ -97,7 +101,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, str]:
         (*_, kind), of, at = _rows_of(problem.replace(residuals=residuals))
         try:
             values = lambda *given: model.values(*given)  # a new function: an earlier trace may have had other globals
-            traced, result = jax.make_jaxpr(values, return_shape=True)(kind, of, *at)
+            with _checked_indices():
+                traced, result = jax.make_jaxpr(values, return_shape=True)(kind, of, *at)
             shape = result.shape[::-1]
         except Exception as error:
             text = " ".join(str(error).split())
@@ -120,6 +125,17 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, str]:
         if np.mean(np.abs(change / (2 * STEP) - rate).max(axis=0) > AGREE * size) > 0.5:
             raise ProblemError(f"derivatives of residual {name} do not agree with differences")
     return shape[1], _source(traced)
+
+
+@contextlib.contextmanager
+def _checked_indices() -> Iterator[None]:
+    """Indices that are out of range raise an IndexError; JAX takes the nearest number otherwise."""
+    before = jax.config.values[CHECKED_INDICES]
+    jax.config.update(CHECKED_INDICES, True)
+    try:
+        yield
+    finally:
+        jax.config.update(CHECKED_INDICES, before)
 
 
 def _source(traced: Any) -> str:

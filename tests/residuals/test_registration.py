@@ -124,6 +124,10 @@ def refused():
         ),
         "nothing depends": (of(idle(pose=0, point=0, at=1.0)), "residual idle depends on pose in no row"),
         "infinite": (of(logarithm(point=0, at=1e6)), "residual logarithm is not finite at the start in row 0"),
+        "a short block": (
+            of(depths(pose=0, point=0, image=0), unknowns={"image": np.ones((CAMERAS, 1))}),
+            "residual depth cannot be computed: .*index 1 out of bounds for axis 0 with size 1",
+        ),
         "complex": (of(complex_numbers(point=0)), "residual complex_numbers cannot be computed: .*it returns complex"),
         "a matrix": (of(table(point=0)), "residual table must return a number or a vector"),
         "an error": (of(broken(point=0)), "residual broken cannot be computed: .*nothing"),
