@@ -1,6 +1,6 @@
 """Pose graphs beside GTSAM and Ceres: final costs, and milliseconds an iteration with residuals of C++ and of Python.
 
-    python -m benchmarks.pose_graph [--poses 1000] [--python 200]
+    python -m benchmarks.pose_graph [--poses 1000] [--python 200] [--linear-solver auto]
 
 Needs gtsam and pyceres in the same Python. The graph is a walk on a sphere with loop closures between its rounds, of
 which each start is the sum of its noisy steps. All have GTSAM's error `Log(T_measured^-1 T_1^-1 T_2)`, rotation before
@@ -11,6 +11,7 @@ and Ceres, by JAX here; they are timed on `--python` poses. Compilation is not c
 from __future__ import annotations
 
 import argparse
+import functools
 import time
 
 import gtsam  # pyright: ignore[reportMissingImports]
@@ -22,6 +23,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 import jaxba
+from jaxba.problem.options import LinearSolverChoice
 from jaxba.rotations import angle_axis, left_jacobian_inverse
 
 SIGMA = np.array([0.02] * 3 + [0.1] * 3)
@@ -79,16 +81,19 @@ def problem_of(graph: Graph) -> jaxba.BundleProblem:
     return jaxba.with_residual(problem, rows)
 
 
-def with_jaxba(graph: Graph) -> tuple[float, float, str]:
+def with_jaxba(graph: Graph, linear_solver: LinearSolverChoice) -> tuple[float, float, str]:
     """Final cost, seconds an iteration, and what else there is to say."""
     started = time.perf_counter()
     problem = problem_of(graph)
     registered = time.perf_counter() - started
-    options = jaxba.SolveOptions(compilation="full", tolerances=jaxba.Tolerances(1e-14, 1e-14, 1e-14))
+    tight = jaxba.Tolerances(1e-14, 1e-14, 1e-14)
+    options = jaxba.SolveOptions(compilation="full", linear_solver=linear_solver, tolerances=tight)
     solutions = [jaxba.solve(problem, "ceres", options) for _ in range(3)]
     best = min(one.total_s / one.iterations for one in solutions)
-    more = f"{solutions[0].iterations} iterations, {solutions[0].linear_solver}, registration {registered:.1f} s, "
-    return solutions[0].final_cost, best, f"{more}compilation {solutions[0].compile_s:.1f} s"
+    products = solutions[0].history.cg_iterations.sum() / solutions[0].iterations
+    one = solutions[0]
+    more = f"{one.iterations} iterations, {one.linear_solver}, {products:.0f} products each"
+    return one.final_cost, best, f"{more}; registration {registered:.1f} s, compilation {one.compile_s:.1f} s"
 
 
 def python_factor(model: gtsam.noiseModel.Base, measured: gtsam.Pose3, first: int, second: int) -> gtsam.CustomFactor:
@@ -189,11 +194,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", type=int, default=1000)
     parser.add_argument("--python", type=int, default=200)
+    parser.add_argument("--linear-solver", default="auto")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     for count, in_python in ((arguments.poses, False), (arguments.python, True)):
         graph = Graph(count)
-        runs = {"jaxba": with_jaxba, "gtsam, C++": lambda graph: with_gtsam(graph, False)}
+        own = functools.partial(with_jaxba, linear_solver=arguments.linear_solver)
+        runs = {"jaxba": own, "gtsam, C++": lambda graph: with_gtsam(graph, False)}
         if in_python:
             runs |= {"gtsam, Python": lambda graph: with_gtsam(graph, True), "ceres, Python": with_ceres}
         print(f"{count} poses, {len(graph.first)} relative poses")

@@ -20,7 +20,7 @@ from jaxba.problem.checks import shown
 from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
-from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residuals, Rows, with_rows
+from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residual, Residuals, Rows, with_rows
 from jaxba.runtime.compilation import program
 from jaxba.runtime.numerics import numerics
 from jaxba.structure.agreement import ALONE
@@ -63,8 +63,8 @@ def with_residual(
     counts = {POSE: problem.num_cameras, LENS: lenses, POINT: problem.num_points}
     rows = replace(rows, loss=loss or Loss(), size=1)
     found = with_rows(problem.residuals, rows, dict(unknowns or {}), counts)
-    size, source = _checked(problem, found)
-    rows = replace(found.rows[-1], size=size, residual=replace(rows.residual, source=source))
+    size, known = _checked(problem, found)
+    rows = replace(found.rows[-1], size=size, residual=known)
     return problem.replace(residuals=replace(found, rows=(*found.rows[:-1], rows)))
 
 
@@ -94,8 +94,8 @@ def _rows_of(problem: BundleProblem) -> tuple[tuple[ResidualSlots, ...], Unknown
     return kinds, of, (jnp.asarray(here.cameras.T), jnp.asarray(here.points.T))
 
 
-def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, str]:
-    """Numbers in a row of the last residual, if there is nothing wrong with it, and its `Residual.source`."""
+def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residual]:
+    """Numbers in a row of the last residual, if there is nothing wrong with it, and that residual with its source."""
     name = residuals.rows[-1].residual.name
     with numerics(np.float64):
         (*_, kind), of, at = _rows_of(problem.replace(residuals=residuals))
@@ -111,7 +111,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, str]:
             raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[:0:-1]}")
         if len(kind.points) > 1 and shape[1] > POSE_SIZE:  # of the camera that splits it
             raise ValueError(f"residual {name} has two points in a row, so at most {POSE_SIZE} numbers, not {shape[1]}")
-        kind = replace(kind, rows=replace(kind.rows, size=shape[1], loss=Loss()))
+        known = replace(kind.rows.residual, source=_source(traced))
+        kind = replace(kind, rows=replace(kind.rows, size=shape[1], loss=Loss(), residual=known))
         random = np.random.default_rng(0)
         change = tuple(random.standard_normal(x.shape) * np.maximum(1.0, np.abs(x)) for x in at)
         found = jax.device_get(program(_examined, level="quick")(kind, of, at, change))
@@ -124,7 +125,7 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, str]:
         size = np.abs(rate).max(axis=0) + 1e-6 * np.abs(residual).max(axis=0)
         if np.mean(np.abs(change / (2 * STEP) - rate).max(axis=0) > AGREE * size) > 0.5:
             raise ProblemError(f"derivatives of residual {name} do not agree with differences")
-    return shape[1], _source(traced)
+    return shape[1], known
 
 
 @contextlib.contextmanager

@@ -30,8 +30,9 @@ from jaxba.structure.residual_slots import ResidualSlots
 from jaxba.structure.segment_sums import take_each
 from jaxba.structure.unknowns import Unknowns
 
-LARGEST = 5_000
-"""Most operations on vectors that a residual is differentiated as: these take a second to trace."""
+LARGEST = 1_000
+"""Most operations that a residual is differentiated as on vectors. Measured on chains of sines: a solve compiles 1.8
+times as long as with the mapped function for 1,080, 2.5 times for 3,600, 7 times for 9,720. A projection has 300."""
 
 
 class Differentiated(NamedTuple):
@@ -66,6 +67,8 @@ def differentiated(
 
 
 def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Array]:
+    """The numbers of `Differentiated`. Raises NotImplementedError: there is no rule for something in the function, or
+    it is too large."""
     over_rows = given[3].ndim - 2
     numbers = [numbers_of(x, x.ndim - over_rows) for x in given]
     function, parameters = Traced(functools.partial(_value, rows, unknowns), *numbers), numbers[:4]
@@ -87,6 +90,8 @@ def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[
 
 
 def _mapped(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Array]:
+    """The same of any function."""
+
     def backward(*given: Array) -> tuple[Array, tuple[Array, ...]]:
         at = lambda *parameters: _value(rows, unknowns, *parameters, *given[4:])
         residual, pull = jax.vjp(at, *given[:4])

@@ -20,6 +20,7 @@ from jaxba.problem.checks import shown
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.preprocess import observed
 from jaxba.problem.residuals import Residuals
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
@@ -133,8 +134,8 @@ def _warn_of_more_than_is_free(known: int) -> None:
 
 
 def _placed(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
-    """The observed cameras, without those whose place in their rig is optimised."""
-    seen = np.unique(problem.camera_index)
+    """The cameras with pixels or rows of residuals, without those whose place in their rig is optimised."""
+    seen = np.flatnonzero(observed(problem)[0])
     if problem.rigs is None or problem.rigs.free is None:
         return seen
     return seen[~np.asarray(problem.rigs.free)[seen]]

@@ -114,7 +114,7 @@ def choose_linear_solver(
 def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
     """The linear solver with the lowest predicted time to convergence. Without pixels, as in a pose graph, it is a
     factorisation if memory allows: conjugate gradients take some 75 products a step there, and twice to six times the
-    iterations (`python -m benchmarks.pose_graph`). Arguments as for `work`."""
+    iterations (`python -m benchmarks.pose_graph --linear-solver implicit`). Arguments as for `work`."""
     predicted = predict(problem, observations)
     if problem.residuals and stands_for_rows(problem).all() and np.isfinite(predicted["explicit"]):
         return "explicit"
