@@ -169,7 +169,7 @@ def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_
 def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
     problem = support.tiny()
     own = with_lenses(problem, np.arange(6), np.ones((6, 3), bool))
-    plain, same = solve(problem, "bold"), solve(own, "learned")
+    plain, same = solve(problem, "bold"), solve(own, "bold")
     np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-9)  # two programs
 
 
