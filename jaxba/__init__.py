@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxba import residuals
+_collects = gc.isenabled()
+gc.disable()  # imports make no garbage, and looking for it takes a tenth of their time
+
 from jaxba.damping import (
     POLICIES,
     Ceres,
@@ -48,10 +51,6 @@ from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, S
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb
 from jaxba.problem.residuals import residual
 from jaxba.problem.rigs import Rigs
-from jaxba.results.alternation import solve_and_retriangulate
-from jaxba.results.covariance import Covariance, covariance
-from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
-from jaxba.results.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.iteration import Carry
@@ -62,21 +61,39 @@ from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.solve import Solution, solve
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.typing import register_pytree
-from jaxba.viewer.notebook import view
 
 if TYPE_CHECKING:
+    from jaxba import residuals
+    from jaxba.results.alternation import solve_and_retriangulate
+    from jaxba.results.covariance import Covariance, covariance
+    from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
+    from jaxba.results.retriangulate import Retriangulation, retriangulate
     from jaxba.training.api import make_env, train
+    from jaxba.viewer.notebook import view
+
+if _collects:
+    gc.enable()
 
 __version__ = "0.1.0"
 
-_OF_THE_LABORATORY = {"make_env": "jaxba.training.api", "train": "jaxba.training.api"}
-"""Modules of public names that are loaded when they are first asked for."""
+_LATE = {
+    "results.alternation": ("solve_and_retriangulate",),
+    "results.covariance": ("Covariance", "covariance"),
+    "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
+    "results.retriangulate": ("Retriangulation", "retriangulate"),
+    "training.api": ("make_env", "train"),
+    "viewer.notebook": ("view",),
+}
+"""Public names that most solves do without, by module; they are loaded when they are first asked for."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _OF_THE_LABORATORY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_OF_THE_LABORATORY[name]), name)
+    if name == "residuals":
+        return importlib.import_module("jaxba.residuals")
+    for module, names in _LATE.items():
+        if name in names:
+            return getattr(importlib.import_module(f"jaxba.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 __all__ = [

@@ -5,13 +5,13 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
-from functools import partial
+from functools import cache, partial
 from io import StringIO
 from itertools import pairwise
-from textwrap import dedent
 from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
@@ -49,13 +49,20 @@ def options(cls: type[Arguments]) -> type[Arguments]:
     return cls if "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
 
 
-def _texts(cls: type) -> dict[str, str]:
-    """The text below each field of a class, in one line."""
+@cache
+def _classes(module: str) -> dict[str, Any]:
+    """The syntax trees of the classes of a module, by name."""
     try:
-        body: Any = ast.parse(dedent(inspect.getsource(cls))).body[0]
+        body = ast.parse(inspect.getsource(sys.modules[module])).body
     except OSError:  # installed without source
         return {}
-    pairs = pairwise(body.body)
+    return {one.name: one for one in body if isinstance(one, ast.ClassDef)}
+
+
+def _texts(cls: type) -> dict[str, str]:
+    """The text below each field of a class, in one line."""
+    found = _classes(cls.__module__).get(cls.__name__)
+    pairs = pairwise(found.body if found else ())
     fields = [pair for pair in pairs if isinstance(pair[0], ast.AnnAssign) and isinstance(pair[1], ast.Expr)]
     return {name.target.id: " ".join(text.value.value.split()) for name, text in fields}
 

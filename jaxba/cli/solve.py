@@ -31,8 +31,6 @@ from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.hold import Gauge, hold
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import ConjugateGradients, Intrinsics, LinearSolverChoice, Preconditioner, Rotation, Scaling
-from jaxba.results.alternation import solve_and_retriangulate
-from jaxba.results.covariance import covariance
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
 from jaxba.scenes import DEFAULT_SCENES, random_scene
@@ -395,6 +393,8 @@ def _read(args: Arguments, path: str) -> BundleProblem:
 
 
 def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
+    from jaxba.results.covariance import covariance
+
     with common.notes_printed():
         found = covariance(problem, loss=loss)
     with open_output(path) as file:
@@ -420,6 +420,8 @@ def _iterate(
 
         if not args.retriangulate:
             return solve(problem, policy, options, callback=show, watch=watch), steps
+        from jaxba.results.alternation import solve_and_retriangulate
+
         show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))
         searching = {"on_search": show_search, "watch": watch}
         return solve_and_retriangulate(problem, policy, options, callback=show, **searching), steps

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from jaxba.problem.labels import part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK, observed
-from jaxba.results.retriangulate import Retriangulation
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
 from jaxba.solver.solve import Solution
 from jaxba.structure.padding import capacity_of
+
+if TYPE_CHECKING:
+    from jaxba.results.retriangulate import Retriangulation
 
 _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
 

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.extend.core import Literal
 from jaxtyping import Shaped
 
 CALLS, ELEMENTWISE = (
@@ -92,7 +91,7 @@ def _evaluated(closed: Any, operands: Any) -> list[Numbers]:
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, map(_constant, closed.consts), strict=True))
     known |= zip(jaxpr.invars, operands, strict=True)
-    read = lambda x: _constant(x.val) if isinstance(x, Literal) else known[x]
+    read = lambda x: _constant(x.val) if hasattr(x, "val") else known[x]  # a literal or a variable
     for equation in jaxpr.eqns:
         given = [read(x) for x in equation.invars]
         known |= zip(equation.outvars, _applied(equation, given), strict=True)

@@ -4,9 +4,9 @@ Compiling takes longer than most solves. A program compiled without LLVM's optim
 emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
 (`python -m benchmarks.compilation`). So a single solve starts with such programs, and compiles better ones only after
 as many iterations as would have paid for them from the start: as with skis that may be rented or bought, that costs at
-most about twice the better choice. Where programs are kept on disk, the iterations of earlier processes count too, so
-that repeated calls soon take the better ones from the start. The parts of a step are programs of their own, since they
-gain differently, and are compiled in parallel.
+most about twice the better choice. Where programs are kept on disk, better ones that are there are taken from the
+start, and those that are missing are compiled after the solve, by another process (runtime/background.py). The parts of
+a step are programs of their own, since they gain differently, and are compiled in parallel.
 """
 
 from __future__ import annotations
@@ -155,7 +155,6 @@ class ParallelCompilation:
         # disk, which are bound to a device
         self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
-        self._paths: dict[Program, Path | None] = {}  # files of programs, whether they exist or not
         self.late_s = 0.0
         """Seconds in which `run` has compiled programs that nobody had asked for before."""
 
@@ -175,8 +174,7 @@ class ParallelCompilation:
     def _begin(self, function: Program, *arguments: Any) -> Any:
         cache, path = None if jax.config.values.get("jax_compilation_cache_dir") else _cache, None
         if cache is not None:
-            path = cache.path_for(function.function, *function.split(arguments), function.options)
-            self._paths[function] = path
+            path = self.path(function, *arguments)
             if (stored := cache.load(path)) is not None:
                 self.loaded[function] = stored
                 return stored.out
@@ -219,14 +217,11 @@ class ParallelCompilation:
         self._verified.add(function)
         return result
 
-    def earlier_runs(self, function: Program) -> int:
-        """How often earlier processes have run the program, as far as the cache knows."""
-        return _cache.runs(self._paths.get(function)) if _cache else 0
-
-    def note_runs(self, function: Program, count: int) -> None:
-        """Adds the runs of this process to those that the cache knows."""
-        if _cache:
-            _cache.add_runs(self._paths.get(function), count)
+    def path(self, function: Program, *arguments: Any) -> Path | None:
+        """The file of a program for arguments as for a call, whether it exists or not; None if it is not kept."""
+        if _cache is None or jax.config.values.get("jax_compilation_cache_dir"):
+            return None
+        return _cache.path_for(function.function, *function.split(arguments), function.options)
 
     def _compile_next(self) -> None:
         try:

@@ -30,12 +30,9 @@ from jax import monitoring
 from jaxlib import xla_client
 
 from jaxba.runtime import process
-from jaxba.runtime.atomic import atomic_write, write_text
+from jaxba.runtime.atomic import atomic_write
 
 SUFFIX = ".jaxba-program"
-
-RUNS = ".jaxba-runs"
-"""Ending of the file beside a program that says how often it was run."""
 
 LIMIT = 1 << 30
 """Bytes that a folder's programs may have; the least recently used are removed first."""
@@ -43,7 +40,7 @@ LIMIT = 1 << 30
 IN_MEMORY = 16
 """Programs read from disk that a process keeps: a solve has six."""
 
-_PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
+PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
 """Settings of JAX that change no program."""
 
 
@@ -122,19 +119,6 @@ class ExecutableCache:
         with contextlib.suppress(OSError):
             stored.path.unlink()
 
-    def runs(self, path: Path | None) -> int:
-        """How often earlier processes have run a program of this folder."""
-        try:
-            return 0 if path is None else int(path.with_suffix(RUNS).read_text())
-        except (OSError, ValueError):
-            return 0
-
-    def add_runs(self, path: Path | None, count: int) -> None:
-        """Notes runs of a program; does nothing if they cannot be written."""
-        if path is not None and count:
-            with contextlib.suppress(OSError):
-                write_text(path.with_suffix(RUNS), str(self.runs(path) + count))
-
     def _evict(self) -> None:
         """Removes the least recently used programs, down to `LIMIT`."""
         found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
@@ -143,7 +127,6 @@ class ExecutableCache:
             total += status.st_size
             if total > LIMIT:
                 file.unlink(missing_ok=True)
-                file.with_suffix(RUNS).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -265,7 +248,7 @@ def _describe_type(leaf: Any) -> str:
 
 def _environment() -> str:
     """Everything outside a program that decides how it is compiled: JAX's settings, XLA's flags, the machine."""
-    settings = {name: value for name, value in jax.config.values.items() if not name.startswith(_PRIVATE)}
+    settings = {name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)}
     settings["float"] = jnp.result_type(float)  # whether this thread has x64 on
     devices = [f"{device.platform} {device.device_kind} {device.client.platform_version}" for device in jax.devices()]
     flags = os.environ.get("XLA_FLAGS", "")

@@ -28,6 +28,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import Candidate, comparison
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.candidates import Search, first_search, has_repairs, next_search
+from jaxba.runtime.background import Wanted, compile_later, outline
 from jaxba.runtime.compilation import (
     Compilation,
     Level,
@@ -42,6 +43,13 @@ from jaxba.solver.drivers import Driver
 from jaxba.solver.iteration import Carry, advance, begin, problem_info
 from jaxba.structure.layout import Layout, num_partitions
 
+WORTH_S = 0.15
+"""Seconds of quickly compiled iterations from which on better programs are compiled for later calls: a seventh of the
+shortest call."""
+
+NEVER = sys.maxsize
+"""Runs of a quick program after which a better one is compiled, if it never is."""
+
 Call = Callable[..., Any]
 """Runs a program with these arguments, or compiles it for them."""
 
@@ -54,21 +62,17 @@ class Stepwise(Driver):
         for `Driver`."""
         super().__init__(*arguments)
         self._first, self._runs = first, Counter[str]()
-        self._earlier, self._quick = Counter[str](), dict[str, Program]()  # runs of earlier processes, quick programs
         self._levels = self._levels_now()
+        self._wanted: dict[str, Wanted] = {}  # fully optimised programs of which the quick ones were run
+        self._seen, self._ran_quick, self._quick_s = set[str](), False, 0.0
         self._programs, self._compile_s = ParallelCompilation(), 0.0
 
     def _levels_now(self) -> dict[str, Level]:
-        done = self._runs + self._earlier
-        return {name: "quick" if done[name] < runs else "full" for name, runs in self._first.items()}
+        return {name: "quick" if self._runs[name] < runs else "full" for name, runs in self._first.items()}
 
     def _run(self, function: Program, *arguments: Any) -> Any:
         self._runs[function.function.__name__] += 1
         return self._programs.run(function, *arguments)
-
-    @property
-    def _optimised(self) -> bool:
-        return set(self._levels.values()) == {"full"}
 
     def compile_s(self) -> float:
         """See `Driver`."""
@@ -79,13 +83,9 @@ class Stepwise(Driver):
         began, setup = time.perf_counter(), self.setup
         with self._programs as compile_programs:
             self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
-        self._earlier = Counter({name: self._programs.earlier_runs(one) for name, one in self._quick.items()})
         state = jax.block_until_ready(setup.initial(self._run))
         self.carry = jax.block_until_ready(self._begin(self._run, state))
         if self.clock.seconds > 0 or self._programs.loaded:
-            # warm-up, so that the first iteration is timed like later ones: a first run also allocates memory
-            if self._optimised:
-                jax.block_until_ready(self._iterate(self._run, self.carry)[2])
             self._compile_s = time.perf_counter() - began - self._programs.late_s
         return state
 
@@ -96,14 +96,33 @@ class Stepwise(Driver):
             with self._programs:
                 self._iterate(self._programs, self.carry)
             self._compile_s += time.perf_counter() - began
-        self.quick_iterations += not self._optimised
+        self._ran_quick, began = False, time.perf_counter()
         self.carry, step, report = self._iterate(self._run, self.carry)
-        return _unpack(report, step)
+        unpacked = _unpack(report, step)
+        if self._ran_quick:
+            self.quick_iterations += 1
+            self._quick_s += time.perf_counter() - began
+        return unpacked
 
     def end(self) -> None:
         """See `Driver`."""
-        for name, one in self._quick.items():
-            self._programs.note_runs(one, self._runs[name])
+        if self._quick_s > WORTH_S and (wanted := [one for one in self._wanted.values() if not one.path.exists()]):
+            compile_later(wanted)
+
+    def _part(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, ...]:
+        """The program of a part of the step at its level, and its arguments. A fully optimised one that is on disk is
+        taken; one that is not is noted."""
+        name = function.__name__
+        if name not in self._seen and 0 < self._first[name] < NEVER:
+            self._seen.add(name)
+            path = self._programs.path(program(function, "options"), *arguments)
+            if path and path.exists():
+                self._first = {**self._first, name: 0}
+                self._levels = self._levels_now()
+            elif path:
+                self._wanted[name] = Wanted(function, outline(arguments), path)
+        self._ran_quick |= self._levels[name] == "quick"
+        return program(function, "options", level=self._levels[name]), *arguments
 
     def _begin(self, call: Call, state: LMState) -> Carry:
         """The carry before the first iteration, from the initial state."""
@@ -117,22 +136,15 @@ class Stepwise(Driver):
         """One iteration: the next carry, its record, and the packed report for the host."""
         state, layout, options, policy = carry.state, self.setup.layout, self.setup.options, self.setup.policy
 
-        def part(function: Callable[..., Any]) -> Program:
-            level = self._levels[name := function.__name__]
-            found = program(function, "options", level=level)
-            if level == "quick":
-                self._quick[name] = found
-            return found
-
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(policy.min_gain, state.cost.dtype)
         arguments = (layout, state, carry.damping)
-        proposal = call(part(propose), *arguments, options, carry.iteration)
+        proposal = call(*self._part(propose, *arguments, options, carry.iteration))
         arguments = (*arguments, proposal, options, min_gain)
         if has_repairs(options):
-            state, step = try_step_by_parts(call, part, *arguments)
+            state, step = try_step_by_parts(call, self._part, *arguments)
         else:
-            state, step = call(part(try_step), *arguments)
+            state, step = call(*self._part(try_step, *arguments))
         partitions = np.int32(num_partitions(layout))
         policy_arguments = (carry._replace(state=None), step, policy, self.tolerances, self.limit, partitions)
         carry, report = call(program(_advance_and_pack, level="quick"), *policy_arguments)
@@ -156,7 +168,7 @@ def quick_runs_of(compilation: Compilation, observations: int, options: StepOpti
     if compilation == "full" or not compiler_options("quick"):
         return dict.fromkeys(parts, 0)
     if compilation == "quick":
-        return dict.fromkeys(parts, sys.maxsize)
+        return dict.fromkeys(parts, NEVER)
     return {name: quick_runs(part, observations) for name, part in parts.items()}
 
 
@@ -187,7 +199,7 @@ def camera_round(layout: Layout, candidate: Candidate, options: StepOptions) -> 
 
 def try_step_by_parts(
     call: Call,
-    part: Callable[[Callable[..., Any]], Program],
+    part: Callable[..., tuple[Any, ...]],
     layout: Layout,
     state: LMState,
     damping: Any,
@@ -198,16 +210,16 @@ def try_step_by_parts(
     """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
     Camera rounds are not compiled before they are run. `part` gives the program of a part of the step, at its present
-    level."""
+    level, and the arguments."""
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:
         arguments = (layout, state, proposal, options, min_gain, search, refined)
-        search, following = call(part(try_candidate), *arguments)
+        search, following = call(*part(try_candidate, *arguments))
         if not isinstance(following, Array) or int(following) == NOTHING:
             break
         if int(following) == CAMERA_ROUND:
-            refined = call(part(camera_round), layout, search.candidate, options)
+            refined = call(*part(camera_round, layout, search.candidate, options))
     return call(program(take_step, "options", level="quick"), layout, state, damping, proposal, search.best, options)
 
 

@@ -1,0 +1,94 @@
+"""Programs that a later process will want, compiled by a process of their own after this one.
+
+A call that ran quickly compiled programs for long leaves the fully optimised ones to such a process. It has the lowest
+priority, one at a time works for a folder of programs, and the system ends it after `LIMIT_S` seconds of processor
+time. It gets what to compile through a pipe; nothing that lies on disk is unpickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import pickle
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxba.runtime import compilation
+from jaxba.runtime.executable_cache import PRIVATE
+from jaxba.runtime.numerics import numerics
+
+LIMIT_S = 120
+"""Seconds of processor time after which the process is ended: four times what the largest real problem took."""
+
+LOCK = "compiling"
+"""File of a folder of programs that the process holds locked."""
+
+
+class Wanted(NamedTuple):
+    """A program to compile fully, and the file that it belongs into."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]  # shapes and types in the place of arrays
+    path: Path
+
+
+def outline(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The arguments with shapes and types in the place of arrays."""
+    typed = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=getattr(x, "weak_type", False))
+    return jax.tree.map(lambda x: typed(x) if hasattr(x, "dtype") else x, arguments)
+
+
+def compile_later(wanted: Sequence[Wanted]) -> None:
+    """Begins to compile programs, all for one folder, in a process that outlives this one. Does nothing where that is
+    not possible, as with a function of a user that cannot be pickled."""
+    settings = {name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)}
+    with contextlib.suppress(Exception):
+        content = pickle.dumps((settings, jnp.result_type(float).name, list(wanted)))
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        assert process.stdin is not None
+        with process.stdin as pipe:
+            pipe.write(content)
+        process.returncode = 0  # nobody waits for it, and Python need not warn of that
+
+
+def _compile(settings: dict[str, Any], dtype: str, wanted: Sequence[Wanted]) -> None:
+    for name, value in settings.items():
+        if jax.config.values.get(name) != value:
+            jax.config.update(name, value)
+    compilation.use_cache(wanted[0].path.parent)
+    with numerics(dtype), compilation.ParallelCompilation() as compile_programs:
+        for function, arguments, path in wanted:
+            one = compilation.program(function, "options", level="full")
+            if compile_programs.path(one, *arguments) == path and not path.exists():
+                compile_programs(one, *arguments)
+
+
+def main() -> None:
+    """Compiles what standard input asks for, unless another process is at it."""
+    os.nice(19)
+    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
+    settings, dtype, wanted = pickle.loads(sys.stdin.buffer.read())
+    with (wanted[0].path.parent / LOCK).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return
+        _compile(settings, dtype, wanted)
+
+
+if __name__ == "__main__":
+    main()
