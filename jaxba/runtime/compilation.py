@@ -171,6 +171,12 @@ class ParallelCompilation:
             self._results[function] = self._begin(function, *arguments)
         return self._results[function]
 
+    def read(self, function: Program, *arguments: Any) -> None:
+        """Starts to read a program that may be wanted, if it is on disk."""
+        path = self.path(function, *arguments)
+        if path and path.exists():
+            self(function, *arguments)
+
     def _begin(self, function: Program, *arguments: Any) -> Any:
         cache, path = None if jax.config.values.get("jax_compilation_cache_dir") else _cache, None
         if cache is not None:

@@ -20,6 +20,7 @@ import threading
 import types
 import zlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -151,6 +152,10 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
         monitoring.unregister_event_duration_listener(listen)
 
 
+_readers = ThreadPoolExecutor(max_workers=2)
+"""Read programs, whose machine code takes XLA 0.1 s each, while others are looked for."""
+
+
 @functools.lru_cache(maxsize=IN_MEMORY)
 def _load(path: Path) -> CachedExecutable:
     header, _, code = zlib.decompress(path.read_bytes()).partition(b"\n")
@@ -158,10 +163,11 @@ def _load(path: Path) -> CachedExecutable:
     process.register_lapack()
     device = jax.devices()[0]
     devices = xla_client.DeviceList((device,))
-    executable = device.client.deserialize_executable(code, executable_devices=devices)
+    reading = _readers.submit(device.client.deserialize_executable, code, executable_devices=devices)
+    put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(x, device)  # all arrays are on this device
 
     def run(*arguments: Any) -> Any:
-        results = executable.execute_sharded(jax.device_put(jax.tree.leaves(arguments), device))
+        results = reading.result().execute_sharded([put(x) for x in jax.tree.leaves(arguments)])
         arrays = [array for (array,) in results.disassemble_into_single_device_arrays()]
         return jax.tree.unflatten(jax.tree.structure(out), arrays)
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import threadpoolctl
 from threadpoolctl import ThreadpoolController
 
@@ -190,9 +191,9 @@ if hasattr(os, "register_at_fork"):
 def register_lapack() -> None:
     """Lets jaxlib look up LAPACK's routines in SciPy, which it does when it first lowers a call of one on a CPU. A
     compiled program from a file that calls one before would crash."""
-    import jax
+    from jaxlib import lapack
 
-    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), "float32"))
+    lapack.prepare_lapack_call("potrf_ffi", np.dtype("float64"))
 
 
 def load_lapack() -> None:

@@ -209,13 +209,15 @@ def try_step_by_parts(
 ) -> tuple[LMState, StepInfo]:
     """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
-    Camera rounds are not compiled before they are run. `part` gives the program of a part of the step, at its present
+    Camera rounds are read from disk, but not compiled, before they are run. `part` gives the program of a part of the step, at its present
     level, and the arguments."""
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:
         arguments = (layout, state, proposal, options, min_gain, search, refined)
         search, following = call(*part(try_candidate, *arguments))
+        if isinstance(call, ParallelCompilation) and options.refinement.camera_rounds:
+            call.read(*part(camera_round, layout, search.candidate, options))
         if not isinstance(following, Array) or int(following) == NOTHING:
             break
         if int(following) == CAMERA_ROUND:
