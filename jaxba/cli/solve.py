@@ -98,9 +98,9 @@ class Step:
     """How a step is computed."""
 
     policy: Annotated[str, "NAME"] = DEFAULT_POLICY
-    """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), bold (the smallest lambda that the guard
-    of agents allows), learned (the shipped network, without embedded iterations), a .safetensors file of jaxba-train,
-    or a rule: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most
+    """Damping policy, which chooses lambda: guarded (1e-6, then 1e-8 until a step fails), bold (the smallest lambda
+    that the guard of agents allows), learned (the shipped network, without embedded iterations), a .safetensors file of
+    jaxba-train, or a rule: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most
     rules take the first lambda, as in classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is
     --refine-points K."""
 
@@ -163,6 +163,9 @@ class Stop:
 
     gtol: float = DEFAULTS.tolerances.gtol
     """Stop at this largest gradient entry."""
+
+    within: float = DEFAULTS.within
+    """Stop when the cost is estimated to be nearer to its end, relatively: 1e-3 where 0.1% does not matter."""
 
     retriangulate: bool = False
     """After convergence, move points to depths with a lower cost and go on."""
@@ -266,6 +269,7 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
             intrinsics=args.intrinsics,
             loss=Loss(args.loss, args.loss_scale),
             tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
+            within=args.within,
             max_iterations=args.max_iterations,
             pad={"auto": None, "yes": True, "no": False}[args.pad],
             compilation=args.compilation,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -114,8 +115,10 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     as_colmap = f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px" if problem.labels is not None else ""
     kinds = solution.costs.items() if problem.residuals else ()
     by_kind = [f"of it at the end: {', '.join(f'{name} {cost:.6e}' for name, cost in kinds)}"] if kinds else []
+    distance = solution.distance
+    left = f"; estimated within {distance:.1e} of the end" if math.isfinite(distance) else ""
     lines = [
-        f"{state}: {solution.termination.reason}",
+        f"{state}: {solution.termination.reason}{left}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
         *by_kind,
         f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "

@@ -89,11 +89,7 @@ class AgentConfig:
         return replace(options, refinement=self.refinement, coordinates=coordinates)
 
 
-def embedded(points: int = EMBEDDED.points) -> AgentConfig:
+def embedded() -> AgentConfig:
     """An agent whose step has all embedded iterations, and distortion stepped per pixel. Candidates without sufficient
-    decrease (Nocedal, Wright 2006, algorithm 4.1) are shortened and tried again.
-
-    Args:
-        points: point iterations.
-    """
-    return AgentConfig(min_gain=0.25, refinement=replace(EMBEDDED, points=points), lens_step="pixels")
+    decrease (Nocedal, Wright 2006, algorithm 4.1) are shortened and tried again."""
+    return AgentConfig(min_gain=0.25, refinement=EMBEDDED, lens_step="pixels")

@@ -9,6 +9,7 @@ made it short.
 from __future__ import annotations
 
 import enum
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.records import StepInfo
 from jaxba.refinement.acceptance import COST_ROUNDING
+from jaxba.typing import AnyArray
 
 DAMPING_LIMIT = 1e32
 """A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
@@ -28,6 +30,12 @@ than this many times as large."""
 FRACTION_ROUNDING = 64.0
 """Machine epsilons within which a damping fraction counts as one: with lambda = 1e30 it was computed as 1 or just
 below."""
+
+
+LEFT_BY_DAMPING, LEAST_LEFT, MOST_LEFT = 3000.0, 0.01, 300.0
+"""What is left after a step, in units of its decrease, is at most the first number times the damping fraction, between
+the other two. Of the default's steps on half of 200 real and random problems, these hold the distance to the end in 95
+of 100 solves (`python -m benchmarks.default_policy --within`)."""
 
 
 class Termination(enum.IntEnum):
@@ -44,11 +52,13 @@ class Termination(enum.IntEnum):
     TARGET = 8
     ROUNDING = 9
     NO_WEIGHT = 10
+    WITHIN = 11
 
     @property
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
-        return self in (Termination.COST, Termination.STEP, Termination.GRADIENT, Termination.ROUNDING)
+        tests = ("COST", "STEP", "GRADIENT", "ROUNDING", "WITHIN")
+        return self.name in tests
 
     @property
     def reason(self) -> str:
@@ -67,6 +77,7 @@ _REASONS = {
     Termination.MAX_ITERATIONS: "iteration limit",
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
+    Termination.WITHIN: "estimated as near to the end as asked for",
     Termination.TARGET: "cost at or below the target",
     Termination.DAMPING_LIMIT: "lambda at its upper limit, or not a number, and still rejected",
 }
@@ -89,6 +100,24 @@ class Tolerances(NamedTuple):
 
     target: float = 0.0
     """Cost in pixels^2 at or below which a solve ends, converged or not; 0 switches it off."""
+
+    within: float = 0.0
+    """Estimated relative distance of the cost to its end at which a solve ends (`distance_to_end`); 0 switches it
+    off."""
+
+
+def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Float[AnyArray, "..."]:
+    """How far a cost is above the one at which the solve would end, relative to it: an estimate that is seldom too
+    small, infinite after a rejected or shortened step.
+
+    What is left to do after a step is what damping kept it from doing. Where damping has no share of it (the fraction
+    is zero), next steps decrease the cost by far less than this one; in a flat valley, where it has, by as much for
+    many times. `where` is NumPy's for records of NumPy arrays.
+    """
+    decrease, share = (step.previous_cost - step.cost) / step.cost, step.damping_fraction
+    # of one direction the undamped model predicts s^2 / (1 - s^2) times the decrease (`converged_in_cost`)
+    left = decrease * (LEFT_BY_DAMPING * share).clip(LEAST_LEFT, MOST_LEFT) / (1 - share**2)
+    return where(step.accepted & ~(step.step_fraction < 1), left, math.inf)
 
 
 def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
@@ -147,6 +176,7 @@ def termination_of(
         (lost_in_rounding(step), Termination.ROUNDING),
         (limit, Termination.DAMPING_LIMIT),
         (stalled, Termination.STALLED),
+        ((distance_to_end(step) <= tolerances.within) & (tolerances.within > 0), Termination.WITHIN),
         ((step.cost <= tolerances.target) & (tolerances.target > 0), Termination.TARGET),
         (iteration >= max_iterations, Termination.MAX_ITERATIONS),
     ]

@@ -73,6 +73,9 @@ class SolveOptions:
     tolerances: Tolerances = field(default_factory=Tolerances)
     """Convergence tests."""
 
+    within: float = 0.0
+    """Estimated relative distance to the end that is near enough, `Tolerances.within`; 0: no such test."""
+
     max_iterations: int = MAX_ITERATIONS
     """Limit of linear solves; with 0 the cost of the start is computed, and the problem comes back as it is."""
 
@@ -111,6 +114,8 @@ class SolveOptions:
             if getattr(self, name) not in get_args(known):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
         check_count("max_iterations", self.max_iterations, 0)
+        if self.within:
+            object.__setattr__(self, "tolerances", self.tolerances._replace(within=self.within))
         if self.devices is not None:
             check_count("devices", self.devices, 1)
         for name, value in self.tolerances._asdict().items():

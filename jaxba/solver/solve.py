@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.records import StepInfo
-from jaxba.lm.termination import Termination
+from jaxba.lm.termination import Termination, distance_to_end
 from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.residuals import PIXELS
@@ -82,6 +83,15 @@ class Solution(ArrayRecord):
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
         return self.termination.converged
+
+    @property
+    def distance(self) -> float:
+        """How far above its end the final cost is estimated to be, relative to it (`Tolerances.within`); infinite if
+        the last accepted step was shortened."""
+        kept = np.flatnonzero(self.history.accepted)[-1:]
+        with np.errstate(all="ignore"):
+            found = distance_to_end(StepInfo(*(np.asarray(x)[kept] for x in self.history)), np.where)
+        return float(found[0]) if len(kept) else math.inf
 
     @property
     def costs(self) -> dict[str, float]:

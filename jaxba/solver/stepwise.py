@@ -209,8 +209,8 @@ def try_step_by_parts(
 ) -> tuple[LMState, StepInfo]:
     """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
-    Camera rounds are read from disk, but not compiled, before they are run. `part` gives the program of a part of the step, at its present
-    level, and the arguments."""
+    Camera rounds are read from disk, but not compiled, before they are run. `part` gives the program of a part of the
+    step, at its present level, and the arguments."""
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:

@@ -11,8 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import solve, step_info
 
-from jaxba import Termination, Tolerances
-from jaxba.lm.termination import MAX_UNDAMPED_RATIO, converged_in_cost, lost_in_rounding, termination_of
+from jaxba import SceneConfig, Termination, Tolerances, random_scene
+from jaxba.lm.termination import (
+    LEAST_LEFT,
+    MAX_UNDAMPED_RATIO,
+    converged_in_cost,
+    distance_to_end,
+    lost_in_rounding,
+    termination_of,
+)
 from jaxba.problem import geometry
 
 LIMIT = 30
@@ -51,6 +58,42 @@ def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, d
     info = step_info(True, cost=cost - decrease, previous_cost=cost, damping_fraction=share)
     expected = decrease <= ftol * cost and undamped <= MAX_UNDAMPED_RATIO * ftol * cost
     assert bool(converged_in_cost(info, ftol)) == expected
+
+
+@settings(deadline=None)
+@given(positive, st.floats(1e-6, 1e5), positive, st.floats(1e-9, 1e9))
+def test_the_estimated_distance_to_the_end_is_not_too_small_on_a_parabola(curvature, damping, gradient, end):
+    """`end` is the cost at the minimum."""
+    decrease, undamped, share = quadratic_step(curvature, damping, gradient)
+    before, after = end + undamped, end + undamped - decrease
+    if decrease < 1e-9 * before or share > 1 - 1e-9:
+        return  # rounding decides
+    info = step_info(True, cost=after, previous_cost=before, damping_fraction=share)
+    assert float(distance_to_end(info)) >= (after - end) / after * (1 - 1e-6)
+
+
+def test_of_what_comes_after_a_rejected_or_shortened_step_nothing_is_known():
+    assert not np.isfinite(distance_to_end(step_info(False, cost=1.0, previous_cost=1.0)))
+    assert not np.isfinite(distance_to_end(step_info(True, step_fraction=0.25)))
+    assert distance_to_end(step_info(True, cost=1.0, previous_cost=2.0)) == LEAST_LEFT
+    steps = step_info(True, cost=1.0, previous_cost=2.0, damping_fraction=np.array([1e-9, 1e-4, 1e-2, 0.5]))
+    assert (np.diff(distance_to_end(steps)[1:]) > 0).all()
+
+
+@pytest.mark.parametrize("rule", ["guarded", "ceres"])
+def test_a_solve_ends_as_near_to_its_end_as_asked_for(rule):
+    scene = random_scene(SceneConfig(cameras=20, points=150), 0)
+    whole = solve(scene, rule)
+    for within in (1e-1, 1e-3):
+        found = solve(scene, rule, within=within)
+        assert found.termination == Termination.WITHIN
+        assert found.converged
+        assert found.iterations < whole.iterations
+        assert found.final_cost <= whole.final_cost * (1 + within)
+        assert found.distance <= within
+    assert solve(scene, rule, within=1e-30).iterations == whole.iterations
+    with pytest.raises(ValueError, match="within must not be negative"):
+        solve(scene, rule, within=-1.0)
 
 
 def test_a_rejected_step_never_ends_a_solve_as_converged():
