@@ -77,7 +77,7 @@ def test_no_public_function_hides_a_module():
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == alone
 
 
-NEED_VISER = {f"jaxba.viewer.{name}" for name in ("curve", "extra", "layers", "page", "page_file", "stage")}
+NEED_VISER = {f"jaxba.viewer.{name}" for name in ("curve", "extra", "layers", "page", "page_file", "stage", "words")}
 
 
 @pytest.mark.extra

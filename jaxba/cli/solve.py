@@ -416,16 +416,13 @@ def _iterate(
     with common.notes_printed(), Interrupt("iteration", graceful=alone) as interrupt:
 
         def show(record: IterationRecord) -> bool:
-            if not steps:
-                common.print_line(table.header(float(record.step.previous_cost)))
-            common.print_line(table.row(record, steps[-1].time_s if steps else 0.0))
             steps.append(record)
             return interrupt.requested
 
+        hooks = {"callback": show, "watch": watch, "verbose": True}
         if not args.retriangulate:
-            return solve(problem, policy, options, callback=show, watch=watch), steps
+            return solve(problem, policy, options, **hooks), steps
         from jaxba.results.alternation import solve_and_retriangulate
 
         show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))
-        searching = {"on_search": show_search, "watch": watch}
-        return solve_and_retriangulate(problem, policy, options, callback=show, **searching), steps
+        return solve_and_retriangulate(problem, policy, options, on_search=show_search, **hooks), steps

@@ -1,4 +1,4 @@
-"""Text that `jaxba-solve` prints: a table of the iterations like that of Ceres, and a summary."""
+"""Text that `jaxba-solve` prints around the table of iterations (solver/progress.py): a heading and a summary."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from jaxba.problem.labels import part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK, observed
-from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
 from jaxba.solver.solve import Solution
@@ -26,8 +25,6 @@ from jaxba.structure.padding import capacity_of
 
 if TYPE_CHECKING:
     from jaxba.results.retriangulate import Retriangulation
-
-_COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
 
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
@@ -71,22 +68,6 @@ def _constants(problem: BundleProblem) -> list[str]:
     part = int(poses.any(axis=1).sum()) - whole
     found = (whole, "constant pose"), (part, "partly constant pose"), (points, "constant point")
     return [counted(count, what) for count, what in found if count]
-
-
-def header(initial_cost: float) -> str:
-    """Column names and the row of the initial cost."""
-    return f"{_COLUMNS}\n{0:4d}  {initial_cost:.6e}"
-
-
-def row(record: IterationRecord, time_before: float) -> str:
-    """The row of an iteration, with the accepted cost, and the change of the cost by the candidate."""
-    step = record.step
-    cells = (
-        f"{record.iteration:4d}  {step.cost:.6e}  {step.previous_cost - step.candidate_cost: .2e}   "
-        f"{step.gradient_max:.2e}   {step.step_norm:.2e}  {step.gain_ratio: .2e}  {step.damping:.2e}  "
-        f"{step.cg_iterations:7d}   {record.time_s - time_before:.2e}   {record.time_s:.2e}"
-    )
-    return cells if step.accepted else f"{cells}  rejected"
 
 
 def retriangulated(found: Retriangulation, ftol: float) -> str:

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 VIEWER = "jaxba.viewer.extra"
 """Module that needs viser."""
 
-NAMED = 5
-"""Worst images that are printed."""
-
 PAUSE_S = 0.3
 """Least time between two updates of the page."""
 
@@ -45,9 +42,6 @@ class Arguments:
     html: Annotated[str | None, "FILE"] = None
     """Write one page that opens without a server and plays the iterations. Nothing is served."""
 
-    port: int = 8080
-    """First port that is tried."""
-
     host: Annotated[str, "ADDRESS"] = "127.0.0.1"
     """Address at which the page is served, without a password; 0.0.0.0 for every machine that reaches this one."""
 
@@ -64,7 +58,6 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def _run(args: Arguments) -> int:
     common.require(bool(args.files), "name a problem or a recording")
-    common.require(0 < args.port < 65536, f"--port must lie between 1 and 65535, is {args.port}")
     common.require(args.images is None or os.path.isdir(args.images), f"--images {args.images}: is no folder")
     _check_host(args.host)
     common.check_writable("--html", args.html)
@@ -80,16 +73,11 @@ def _run(args: Arguments) -> int:
         write_page(shown, args.html)
         common.print_line(f"wrote {args.html} ({os.path.getsize(args.html) / 1e6:.1f} MB)")
         return 0
-    from jaxba.viewer.page import Viewer, heading, worst_images
+    from jaxba.viewer.page import Viewer
 
-    viewer = Viewer(shown, args.port, args.host)
-    for stage in viewer.stages:
-        common.print_line(f"{heading(stage)}, {stage.numbers()}")
-        for text, _ in worst_images(stage, NAMED):
-            common.print_line(f"  worst: {text}")
+    viewer = Viewer(shown, args.host)
     announce(viewer)
-    missing = viewer.load_images()
-    if missing:
+    if missing := viewer.load_images():
         common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
     wait(viewer)
     return 0

@@ -6,6 +6,7 @@ indices in range.
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -164,6 +165,9 @@ class BundleProblem(ArrayRecord):
         own = [f"{len(rows)} rows of {rows.residual.name}" for rows in self.residuals.rows]
         found = [*counts, *(name for name in parts if getattr(self, name) is not None), *own]
         return f"BundleProblem({', '.join(found)})"
+
+    def _repr_html_(self) -> str:
+        return importlib.import_module("jaxba.problem.display").card_of(self)  # which imports this module, and pictures
 
     @property
     def num_cameras(self) -> int:

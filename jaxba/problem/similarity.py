@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import angle_axis, rotation_matrices
+from jaxba.problem.geometry import angle_axis, camera_poses, rotation_matrices
 
 Poses = Float[np.ndarray, "poses 3 4"]
 """Camera-to-world poses `[R | c]`."""
@@ -36,6 +36,26 @@ class Similarity(NamedTuple):
         """Transforms camera-to-world poses: centres as points, orientations by the rotation."""
         centers = self.points(poses[:, :, 3])
         return np.concatenate([self.rotation @ poses[:, :, :3], centers[:, :, None]], axis=2)
+
+
+def upright(problem: BundleProblem) -> Similarity:
+    """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras'
+    upward directions along +z."""
+    poses, points = camera_poses(problem.cameras), np.asarray(problem.points)
+    places = np.concatenate([poses[:, :, 3], points])
+    places = places[np.isfinite(places).all(axis=1)]
+    middle = np.median(points if len(points) else places, axis=0)
+    size = float(np.percentile(np.linalg.norm(places - middle, axis=1), 80)) or 1.0
+    up = -poses[:, :, 1].mean(axis=0)
+    length = np.linalg.norm(up)
+    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    ahead = poses[:, :, 2].mean(axis=0)
+    side = np.cross(ahead, up)
+    if np.linalg.norm(side) < 1e-6:
+        side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
+    side /= np.linalg.norm(side)
+    rotation = np.stack([side, np.cross(up, side), up])
+    return Similarity(1 / size, rotation, -rotation @ middle / size)
 
 
 def transformed(

@@ -20,6 +20,7 @@ from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.drivers import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
+from jaxba.solver.progress import shown
 from jaxba.solver.solve import Solution, solve_without
 
 MAX_ROUNDS = 5
@@ -34,6 +35,7 @@ def solve_and_retriangulate(
     callback: Callback | None = None,
     on_search: Callable[[Retriangulation], None] | None = None,
     watch: Watch | None = None,
+    verbose: bool = False,
 ) -> Solution:
     """`solve` and, if it converged, `retriangulate`, alternately.
 
@@ -49,6 +51,7 @@ def solve_and_retriangulate(
         on_search: called after every retriangulation, including the last one, whose result is discarded if the decrease
             is too small (`Retriangulation.pays`).
         watch: as for `solve`; iterations and seconds are counted over all solves.
+        verbose: as for `solve`.
 
     Returns:
         One solution for all solves. Retriangulation is not an iteration; its time is in `total_s` and `compile_s`.
@@ -57,6 +60,7 @@ def solve_and_retriangulate(
         ValueError, ProblemError: as `solve`.
     """
     options = checked_options(options)
+    callback, compiling = shown(callback, verbose)
     away = set_aside(problem)
     before, stopped = (0, 0.0), False
 
@@ -71,9 +75,9 @@ def solve_and_retriangulate(
     watch_all = None if watch is None else lambda record, now: watch(of_all(record), now)
 
     # a solve with a callback runs from Python, so that all limits use the same programs
-    run = lambda problem, limit: solve_without(
-        away, problem, policy, replace(options, max_iterations=limit), callback=forward, watch=watch_all
-    )
+    hooks = {"callback": forward, "watch": watch_all, "compiling": compiling}
+    limited = lambda limit: replace(options, max_iterations=limit)
+    run = lambda problem, limit: solve_without(away, problem, policy, limited(limit), **hooks)
     solution = run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
         if stopped or not solution.converged or solution.iterations == options.max_iterations:

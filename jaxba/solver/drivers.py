@@ -6,6 +6,7 @@ The third way, from Python, is stepwise.py.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -54,6 +55,9 @@ class Driver:
 
     quick_iterations = 0
     """Iterations in which some program was not fully optimised."""
+
+    compiling: Callable[[], AbstractContextManager] = nullcontext
+    """The context in which programs compile after `begin`."""
 
     def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
         self.setup, self.tolerances, self.clock = setup, tolerances, clock

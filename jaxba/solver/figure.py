@@ -9,7 +9,7 @@ import numpy as np
 from jaxba.lm.records import StepInfo
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from jaxba.problem.display import Picture
 
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#7F7F7F")
 """Okabe and Ito's palette, safe for colour-blind readers; grey for its yellow, which is too light for lines."""
@@ -17,12 +17,12 @@ COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#5
 COST, DAMPING, REJECTED = COLOURS[1], COLOURS[2], COLOURS[-1]
 
 
-def plot_history(history: StepInfo, initial_cost: float) -> Figure:
+def plot_history(history: StepInfo, initial_cost: float) -> Picture:
     """Cost above and lambda below, over the iterations, on logarithmic axes; steps that were rejected are grey. The
     history is that of a solution, NumPy arrays; the initial cost is pixels^2."""
-    from matplotlib.figure import Figure  # late: its import takes 0.3 s
+    from jaxba.problem.display import Picture  # late: the import of matplotlib takes 0.3 s
 
-    figure = Figure(figsize=(6.4, 5.2), layout="constrained")
+    figure = Picture(figsize=(6.4, 5.2), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     iterations = np.arange(1, len(history.cost) + 1)
     rejected = ~np.asarray(history.accepted, bool)

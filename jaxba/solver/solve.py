@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import math
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -24,12 +26,13 @@ from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
+from jaxba.solver.progress import shown
 from jaxba.solver.stepwise import Stepwise, quick_runs_of
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from jaxba.problem.display import Picture
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,11 +103,26 @@ class Solution(ArrayRecord):
         pixels = self.final_cost - sum(others.values()) if self.problem.num_observations else 0.0
         return {PIXELS: pixels, **others}
 
-    def plot(self) -> Figure:
+    def plot(self) -> Picture:
         """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""
         from jaxba.solver.figure import plot_history
 
         return plot_history(self.history, self.initial_cost)
+
+    def _told(self) -> dict[str, str]:
+        return {
+            "converged" if self.converged else "not converged": self.termination.reason,
+            "cost": f"{self.initial_cost:.6g} -> {self.final_cost:.6g}",
+            "iterations": f"{self.iterations} in {self.total_s:.3g} s, compilation {self.compile_s:.3g} s",
+        }
+
+    def __repr__(self) -> str:
+        return f"Solution({', '.join(f'{name}: {value}' for name, value in self._told().items())})"
+
+    def _repr_html_(self) -> str:
+        from jaxba.problem.display import card
+
+        return card({"problem": repr(self.problem).partition("(")[2][:-1], **self._told()}, self.plot())
 
 
 def solve(
@@ -114,6 +132,7 @@ def solve(
     *,
     callback: Callback | None = None,
     watch: Watch | None = None,
+    verbose: bool = False,
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
@@ -136,6 +155,7 @@ def solve(
         callback: called after every iteration; a true return value stops the solve.
         watch: called before it, with the record and a function that gives the problem with the parameters after the
             iteration; the time that it takes is not counted.
+        verbose: whether a row is printed for every iteration, and a line while programs compile.
 
     Returns:
         The optimised problem in NumPy float64 arrays, histories and timings.
@@ -147,7 +167,8 @@ def solve(
         RuntimeError: this process was forked from one in which JAX had started.
         TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`.
     """
-    return solve_without(None, problem, policy, options, callback=callback, watch=watch)
+    callback, compiling = shown(callback, verbose)
+    return solve_without(None, problem, policy, options, callback=callback, watch=watch, compiling=compiling)
 
 
 def solve_without(
@@ -158,14 +179,17 @@ def solve_without(
     *,
     callback: Callback | None,
     watch: Watch | None,
+    compiling: Callable[[], AbstractContextManager] = nullcontext,
 ) -> Solution:
-    """`solve` where it is known which images face away; None: it is not."""
+    """`solve` where it is known which images face away; None: it is not. Programs compile in `compiling`."""
     options = checked_options(options)
     setup = set_up(problem, policy, options, away)
     counted, alone = setup.placed.counted, callback is None and watch is None
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
-        state = driver.begin()
+        driver.compiling = compiling
+        with compiling():
+            state = driver.begin()
         setup.check_cost(state)
         initial_cost, compiled, watched, began = float(state.cost), driver.compile_s(), 0.0, time.perf_counter()
         elapsed = lambda: time.perf_counter() - began - watched - (driver.compile_s() - compiled)

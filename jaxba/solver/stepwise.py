@@ -93,7 +93,7 @@ class Stepwise(Driver):
         """One iteration: its record, of Python scalars, and whether it ended the solve."""
         if self._levels != (now := self._levels_now()):
             self._levels, began = now, time.perf_counter()
-            with self._programs:
+            with self.compiling(), self._programs:
                 self._iterate(self._programs, self.carry)
             self._compile_s += time.perf_counter() - began
         self._ran_quick, began = False, time.perf_counter()

@@ -1,4 +1,4 @@
-"""Where cameras and residuals are drawn: frusta, the similarity to the scene on the page, residuals as segments.
+"""Where cameras and residuals are drawn: frusta, residuals as segments.
 
 Frusta have the axes of COLMAP and OpenCV: x to the right, y downwards, z forwards.
 """
@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.camera_models import BAL
-from jaxba.problem.geometry import COLMAP_FLIP, camera_centers, camera_poses
+from jaxba.problem.geometry import COLMAP_FLIP, camera_centers
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.row_owners import block_groups, owners_of
-from jaxba.problem.similarity import Similarity
 
 WIDEST = 2.0
 """Largest half width of a frustum at distance 1: the tangent of 63 degrees. Fisheyes see more than can be drawn."""
@@ -86,47 +85,24 @@ def _reach(problem: BundleProblem, center: Float[np.ndarray, "cameras 2"]) -> Fl
     return np.maximum(reach, np.where(center.any(axis=1, keepdims=True), np.abs(center), np.median(reach, axis=0)))
 
 
-def to_page(problem: BundleProblem) -> Similarity:
-    """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras'
-    upward directions along +z."""
-    poses, points = camera_poses(problem.cameras), np.asarray(problem.points)
-    places = np.concatenate([poses[:, :, 3], points])
-    places = places[np.isfinite(places).all(axis=1)]
-    middle = np.median(points, axis=0)
-    size = float(np.percentile(np.linalg.norm(places - middle, axis=1), 80)) or 1.0
-    up = -poses[:, :, 1].mean(axis=0)
-    length = np.linalg.norm(up)
-    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    ahead = poses[:, :, 2].mean(axis=0)
-    side = np.cross(ahead, up)
-    if np.linalg.norm(side) < 1e-6:
-        side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
-    side /= np.linalg.norm(side)
-    rotation = np.stack([side, np.cross(up, side), up])
-    return Similarity(1 / size, rotation, -rotation @ middle / size)
-
-
-def depth_of_image(half: Float[np.ndarray, "cameras 2"], scale: float) -> Float[np.ndarray, " cameras"]:
+def depth_of_image(half: Float[np.ndarray, "2"], scale: float) -> float:
     """How far before the camera viser draws the image of a frustum: all frusta of a scale have the same volume."""
-    return scale / np.cbrt(half.prod(axis=1) / 3)
+    return float(scale / np.cbrt(half.prod() / 3))
 
 
 def residual_segments(
-    problem: BundleProblem, frusta: Frusta, residuals: Float[np.ndarray, "observations 2"], camera: int
-) -> tuple[Float[np.ndarray, "own 2 2"], float]:
-    """Residuals of an image as segments from each measured pixel towards the predicted one, in its plane. Returns the
-    segments, and by how much they are magnified: the median is at least as long as a twentieth of the image's width.
-    None is longer than that width. Non-finite residuals are left out."""
+    problem: BundleProblem, frusta: Frusta, residuals: Float[np.ndarray, "all 2"], camera: int, factor: float
+) -> Float[np.ndarray, "own 2 2"]:
+    """Magnified residuals of an image as segments from each measured pixel towards the predicted one, in its plane;
+    what would be longer than all of the image ends outside of it. Non-finite residuals are left out."""
     own = np.flatnonzero((np.asarray(problem.camera_index) == camera) & np.isfinite(residuals).all(axis=1))
     pixels, difference = np.asarray(problem.observations)[own], residuals[own]
     length = np.linalg.norm(difference, axis=1)
-    typical = float(np.median(length)) if len(own) else 0.0
-    width = 2 * frusta.half[camera, 0] * frusta.focal[camera, 0]
-    factor = max(1.0, 0.05 * width / typical) if typical > 0 else 1.0
-    share = np.minimum(factor, width / np.maximum(length, 1e-300))[:, None]
+    diagonal = 2 * float(np.linalg.norm(frusta.half[camera] * frusta.focal[camera]))
+    share = np.minimum(factor, diagonal / np.maximum(length, 1e-300))[:, None]
     cameras = np.full(len(own), camera)
     ends = [frusta.on_plane(place, cameras) for place in (pixels, pixels - share * difference)]
-    return np.stack(ends, axis=1), float(factor)
+    return np.stack(ends, axis=1)
 
 
 def row_segments(problem: BundleProblem) -> list[Float[np.ndarray, "segments 2 3"]]:

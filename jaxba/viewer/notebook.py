@@ -8,15 +8,14 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.solve import Solution
 
 
-def view(what: BundleProblem | Solution, *, port: int = 8080) -> Any:
-    """Serves a page with the cameras and points of a problem, or of a solution.
+def view(what: BundleProblem | Solution) -> Any:
+    """Serves a page with the cameras and points of a problem, or of a solution, to this machine.
 
     Args:
         what: a problem or a solution.
-        port: first one that is tried; the page is reached from this machine only.
 
     Returns:
-        The viewer, with `url` and `close()`; a notebook shows its page.
+        The viewer, with `url` and `close()`; a notebook shows, and saves, a page that needs no server.
 
     Raises:
         ImportError: viser is not installed: pip install jaxba[view].
@@ -25,4 +24,4 @@ def view(what: BundleProblem | Solution, *, port: int = 8080) -> Any:
     from jaxba.viewer.sources import shown
 
     is_solution = isinstance(what, Solution)
-    return Viewer([shown(what.problem if is_solution else what, "solution" if is_solution else "problem")], port)
+    return Viewer([shown(what.problem if is_solution else what, "solution" if is_solution else "problem")])

@@ -1,63 +1,43 @@
-"""The page: stages side by side, and a panel with a slider, numbers, colours and the worst images."""
+"""The page: stages side by side, and a panel with a slider, numbers, colours, filters and the worst images."""
 
 from __future__ import annotations
 
 import html
-import re
+import io
 import socket
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+import time
+from collections.abc import Sequence
 from dataclasses import replace
-from io import StringIO
+from typing import Any
 
 import numpy as np
 
-from jaxba.model.registration import costs_of_rows
-from jaxba.viewer import geometry
+from jaxba.viewer import words
 from jaxba.viewer.curve import add_curve, colour_of, curve_of
-from jaxba.viewer.extra import viser
+from jaxba.viewer.extra import HOST, quietly, viser
+from jaxba.viewer.page_file import page_of, stages
 from jaxba.viewer.recording import Recording
 from jaxba.viewer.sources import Shown
-from jaxba.viewer.stage import ASIDE, KINDS, POINT_SIZE, SHOWN_POINTS, Stage
+from jaxba.viewer.stage import ERROR, POINT_SIZE, SHOWN_POINTS, Stage
 
-PORT = 8080
-"""First port that is tried."""
+NOTHING: str = "none: the whole scene"
 
-BESIDE = 0.2
-"""How far, as a share of the distance, the scene stands beside the middle: the panel is on the right, what a page in a
-file says on the left."""
-
-WORST, WORST_ROWS = 20, 5
-"""Images in the list of the worst, and rows of a residual."""
-
-NOTHING = "none"
-
-
-HOST = "127.0.0.1"
-"""Address under which only this machine reaches the page."""
-
-
-def start_server(port: int = PORT, host: str = HOST) -> viser.ViserServer:
-    """A server at this port or the next free one of an address of this machine."""
-    with redirect_stdout(StringIO()):  # it prints a box with its address
-        return viser.ViserServer(host=host, port=port, label="jaxba", verbose=False)
-
-
-def stop_server(server: viser.ViserServer) -> None:
-    """Ends a server without a word."""
-    with redirect_stdout(StringIO()):
-        server.stop()
+FRAME_S, PICKED, NEAR = 0.5, 8, 0.3
+"""Seconds for which an iteration is shown while the page plays; the largest distance between a click and the point that
+it means, pixels; and how near, as a share of the way to an image, something is drawn in the view of its camera."""
 
 
 class Viewer:
     """A page that is served until it is closed."""
 
-    def __init__(self, all_shown: Sequence[Shown], port: int = PORT, host: str = HOST) -> None:
-        """Serves a page at this port or the next free one of an address of this machine; `0.0.0.0`: of all of them."""
-        self.host, self.server = host, start_server(port, host)
-        self._lock = threading.RLock()
-        self.stages = stages(self.server, all_shown, self.choose, caption="name" if len(all_shown) > 1 else "")
+    def __init__(self, all_shown: Sequence[Shown], host: str = HOST) -> None:
+        """Serves a page at port 8080 or the next free one of an address of this machine; `0.0.0.0`: of all of them."""
+        self.host, self.server = host, quietly(viser.ViserServer, host=host, label="jaxba", verbose=False)
+        self._lock, self._playing = threading.RLock(), False
+        self._hit = self._inside = None  # where the last click met an image, and where the chosen one was taken
+        self.stages = stages(self.server, all_shown, SHOWN_POINTS, self._clicked)
+        self.server.scene.on_click()(self._pointed)
         self._panel()
 
     @property
@@ -68,169 +48,150 @@ class Viewer:
 
     def close(self) -> None:
         """Ends the server."""
-        stop_server(self.server)
+        self._playing = False
+        quietly(self.server.stop)
 
     def load_images(self) -> int:
         """Puts images into frusta; returns how many are not at hand, of those that should be."""
-        wanted = [stage for stage in self.stages if stage.shown.images is not None]
-        return sum(len(stage.frusta) - stage.load_images() for stage in wanted)
+        return sum(stage.load_images() for stage in self.stages)
 
     def _repr_html_(self) -> str:
-        """The page inside of a notebook."""
-        return f'<iframe src="{self.url}" width="100%" height="600" style="border:0"></iframe>'
+        """A page in a file, inside of a notebook: it needs no server, so that a saved notebook shows it."""
+        page = html.escape(page_of([stage.shown for stage in self.stages]))
+        return f'<iframe srcdoc="{page}" width="100%" height="600" style="border:0"></iframe>'
 
-    def choose(self, stage: Stage, camera: int | None) -> None:
-        """Marks an image, and says beside it how well it fits."""
+    def choose(self, stage: Stage, camera: int | None, client: viser.ClientHandle | None = None) -> None:
+        """Marks an image, says how well it fits, and moves a client into its camera, or for None to the whole scene."""
         with self._lock:
             for one in self.stages:
-                one.choose(camera if one is stage else None)
-            if camera is None:
-                self._about.content, self._picture.visible = "", False
-            else:
-                self._describe(stage, camera)
+                one.change(chosen=camera if one is stage else None, tracked=None)
+            self._listed = {name: (one, k) for one in self.stages for name, k in words.worst_images(one)}
+            name = NOTHING if camera is None else words.entry(stage, camera)
+            self._listed |= {} if camera is None else {name: (stage, camera)}
+            self._picked.options, self._picked.value = (NOTHING, *self._listed), name
+            self._tell()
+            if client is not None:
+                self._move(client, stage, camera)
 
-    def _describe(self, stage: Stage, camera: int) -> None:
-        """Words and a picture of a chosen image."""
-        self._about.content = about_image(stage, camera)
-        self._picture.image = stage.picture(camera)
-        self._picture.visible = True
+    def _move(self, client: viser.ClientHandle, stage: Stage, camera: int | None) -> None:
+        start, view, self._inside = self.server.initial_camera, client.camera, None
+        if camera is None:
+            place, target, up, fov, near = start.position, start.look_at, (0.0, 0.0, 1.0), start.fov, start.near
+        else:
+            pose, half, depth = stage.view_of(camera)
+            place, up, near = pose[:, 3] + stage.place, -pose[:, 1], NEAR * depth
+            target, fov = place + depth * pose[:, 2], 2 * np.arctan(1.05 * max(half[1], half[0] / view.aspect))
+            self._inside = place
+        view.position, view.look_at, view.up_direction, view.fov, view.near = place, target, up, float(fov), near
+
+    def _clicked(self, place: int, camera: int, event: viser.SceneNodePointerEvent) -> None:
+        """A click on an image."""
+        if not self._is_inside(event.client):  # there a click is on a point
+            self._hit = event.screen_pos
+            self.choose(self.stages[place], camera, event.client)
+
+    def _is_inside(self, client: viser.ClientHandle) -> bool:
+        """Whether a client looks from the camera that is chosen."""
+        return self._inside is not None and np.allclose(client.camera.position, self._inside, atol=1e-4)
+
+    def _pointed(self, event: viser.SceneClickEvent) -> None:
+        """A click on a point, or on nothing. That on an image comes here, too."""
+        view = event.client.camera
+        ray = np.array(event.ray_origin), np.array(event.ray_direction), PICKED * view.fov / view.image_height
+        if event.screen_pos != self._hit:
+            with self._lock:
+                for stage in self.stages:
+                    stage.pick(*ray, self._is_inside(event.client))
+                self._tell()
 
     def grow(self, recording: Recording) -> None:
         """Shows the last iteration of a solve that is running, unless another one is being looked at."""
-        with self._lock:
-            stage = self.stages[0]
-            newest = stage.iteration == stage.shown.recording.last
-            stage.show(recording.last if newest else None, shown=replace(stage.shown, recording=recording))
-            self._slider.max, self._slider.visible = max(recording.last, 1), recording.last > 0
-            if newest:
-                self._slider.value = recording.last
-            self._tell()
+        shown, last = self.stages[0].shown, recording.last
+        newest = self.stages[0].iteration == shown.recording.last
+        self._change(shown=replace(shown, recording=recording))
+        self._slider.max, self._slider.visible, self._play.visible = max(last, 1), last > 0, last > 0
+        if newest:
+            self._slider.value = last
 
     def _panel(self) -> None:
         gui, last = self.server.gui, max(stage.shown.recording.last for stage in self.stages)
-        gui.configure_theme(show_share_button=False, show_logo=False)
-        lines = [f"**{plain(stage.shown.name)}**: {sizes(stage)}" for stage in self.stages]
+        gui.main_panel.dock_right()
+        dress = lambda dark: gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=dark)
+        dress(False)
+        lines = [f"**{words.plain(stage.shown.name)}**: {words.sizes(stage)}" for stage in self.stages]
         if len(lines) > 1:
             lines = [f'<font color="{colour_of(k)}">●</font> {line}' for k, line in enumerate(lines)]
         gui.add_markdown("\n\n".join(lines))
         self._slider = gui.add_slider("iteration", 0, max(last, 1), 1, last, visible=last > 0)
+        self._play = gui.add_button("play or stop", visible=last > 0)
         self._numbers = gui.add_markdown("")
         self._curve = add_curve(self.server, self.stages)
+        self._picked = gui.add_dropdown("worst images", (NOTHING,))
+        self._about = gui.add_markdown("")
+        if rows := [line for stage in self.stages for line in words.about_rows(stage)]:
+            gui.add_markdown("\n\n".join(rows))
         choices = list(dict.fromkeys(name for stage in self.stages for name in stage.colour_choices()))
         colour = gui.add_dropdown("colour", choices, initial_value=self.stages[0].colour)
-        size = gui.add_slider("size of points", 0.001, 0.03, 0.001, POINT_SIZE)
-        worst = {name: (stage, camera) for stage in self.stages for name, camera in worst_images(stage)}
-        picked = gui.add_dropdown("worst images", (NOTHING, *worst))
-        self._about = gui.add_markdown("Click on an image, or choose one of the worst.")
-        if rows := [line for stage in self.stages for line in about_rows(stage)]:
-            gui.add_markdown("\n\n".join(rows))
-        self._picture = gui.add_image(np.full((1, 1, 3), 255, np.uint8), visible=False)
-        self._slider.on_update(lambda _: self._show(iteration=int(self._slider.value)))
-        colour.on_update(lambda _: self._show(colour=colour.value))
-        picked.on_update(lambda _: self.choose(*worst.get(picked.value, (self.stages[0], None))))
-        size.on_update(lambda _: self._each(lambda stage: stage.layers.size("points", size.value)))
-        if any("start points" in stage.layers for stage in self.stages):
-            start = gui.add_checkbox("start, grey", True)
-            start.on_update(lambda _: self._each(lambda stage: stage.layers.show("start", start.value)))
-        self._tell()
+        ends = [(stage.limits[ERROR][1], stage.measures.tracks.max(initial=2).item()) for stage in self.stages]
+        self._between("error, px", 0, 2 * max(error for error, _ in ends), "errors")
+        self._between("track length", 1, max(length for _, length in ends), "lengths")
+        points = gui.add_slider("size of points", 0.001, 0.03, 0.001, POINT_SIZE)
+        frusta = gui.add_slider("size of frusta", 0.1, 5.0, 0.1, 1.0)
+        named = gui.add_checkbox("names of images", False)
+        dark = gui.add_checkbox("dark", False)
+        self._slider.on_update(lambda _: self._change(iteration=int(self._slider.value)))
+        self._play.on_click(lambda _: self._run())
+        self._picked.on_update(self._listed_picked)
+        colour.on_update(lambda _: self._change(colour=colour.value))
+        points.on_update(lambda _: self._change(point_size=points.value))
+        frusta.on_update(lambda _: self._change(enlarged=frusta.value))
+        named.on_update(lambda _: self._change(named=named.value))
+        dark.on_update(lambda _: dress(dark.value))
+        gui.add_button("save a picture").on_click(self._save)
+        self.choose(self.stages[0], None)
 
-    def _each(self, change: Callable[[Stage], None]) -> None:
+    def _between(self, label: str, low: int, high: Any, name: str) -> None:
+        """A slider for the least and the largest value of the points that are shown; at its end it has no limit."""
+        slider = self.server.gui.add_multi_slider(label, low, high, 1 if low else high / 200, (low, high))
+        ends = lambda least, most: (least if least > low else 0.0, most if most < high else np.inf)
+        slider.on_update(lambda _: self._change(**{name: ends(*slider.value)}))
+
+    def _run(self) -> None:
+        """Plays to the last iteration, from the start if it is shown; a second click ends it."""
+        self._playing = not self._playing
+        while self._playing:
+            self._slider.value = (self._slider.value + 1) % (self._slider.max + 1)
+            time.sleep(FRAME_S)
+            self._playing &= self._slider.value < self._slider.max
+
+    def _listed_picked(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:  # else it follows a click
+            self.choose(*self._listed.get(self._picked.value, (self.stages[0], None)), event.client)
+
+    def _save(self, event: viser.GuiEvent) -> None:
+        """Downloads what a client sees as a picture."""
+        from PIL import Image
+
+        assert event.client is not None  # it has clicked
+        view, file = event.client.camera, io.BytesIO()
+        Image.fromarray(event.client.get_render(view.image_height, view.image_width)).save(file, "PNG")
+        event.client.send_file_download("jaxba.png", file.getvalue(), save_immediately=True)
+
+    def _change(self, **what: Any) -> None:
         with self._lock:
             for stage in self.stages:
-                change(stage)
-
-    def _show(self, iteration: int | None = None, colour: str | None = None) -> None:
-        with self._lock:
-            for stage in self.stages:
-                if iteration != stage.iteration:  # a slider that is drawn calls more often than it changes
-                    stage.show(iteration, colour)
-                if stage.chosen is not None:
-                    self._describe(stage, stage.chosen)
+                stage.change(**what)
             self._tell()
 
     def _tell(self) -> None:
-        """Numbers of the iteration beside the slider."""
+        """Numbers of the iteration beside the slider, and of what was clicked."""
         lines = []
         for stage in self.stages:
-            name = f"**{plain(stage.shown.name)}**: " if len(self.stages) > 1 else ""
-            meaning = stage.limits_text()
-            lines.append(f"{name}{stage.numbers()}" + (f"  \n*{meaning}*" if meaning else ""))
+            name = f"**{words.plain(stage.shown.name)}**: " if len(self.stages) > 1 else ""
+            lines.append(f"{name}{words.numbers(stage)}  \n*{words.meaning(stage)}*")
         self._numbers.content = "\n\n".join(lines)
-        self._curve.data = data = curve_of(self.stages)
-        self._curve.visible = len(data[0]) > 1
-
-
-def stages(
-    server: viser.ViserServer,
-    all_shown: Sequence[Shown],
-    on_click: Callable[[Stage, int], None] | None = None,
-    points: int = SHOWN_POINTS,
-    caption: str = "",
-) -> list[Stage]:
-    """Draws problems and solves side by side, with at most so many points together, and turns the camera to them. A
-    click on an image calls `on_click` with its stage and its number; `caption` is that of a `Stage`."""
-    share = max(points // len(all_shown), 1)
-    found: list[Stage] = []
-    for place, one in enumerate(all_shown):
-        click = None if on_click is None else lambda camera, place=place: on_click(found[place], camera)
-        found.append(Stage(server, one, f"{place + 1}", place, share, click, caption))
-    middle = ASIDE * (len(all_shown) - 1) / 2
-    away = 2.2 + 1.2 * middle
-    across = middle + BESIDE * (away if on_click else -away)
-    server.initial_camera.position = (across, -away, 0.7 * away)
-    server.initial_camera.look_at = (across, 0.0, 0.0)
-    return found
-
-
-def plain(name: str) -> str:
-    """A name as Markdown that means just its characters: viser renders HTML and Markdown as they come."""
-    return re.sub(r"([\\`*_{}\[\]()#+.!|~>-])", r"\\\1", html.escape(name)) if name else name
-
-
-def heading(stage: Stage) -> str:
-    """The name of what is shown, its sizes, and how much of it; plain text."""
-    return f"{stage.shown.name}: {sizes(stage)}"
-
-
-def sizes(stage: Stage) -> str:
-    """Sizes of what is shown, and how much of it."""
-    recording, problem = stage.shown.recording, stage.shown.problem
-    points, cameras = len(stage.points), len(stage.frusta)
-    of_points = f"{points:,} of {recording.whole:,} points" if points < recording.whole else f"{points:,} points"
-    of_cameras = f"{cameras:,} of {problem.num_cameras:,}" if cameras < problem.num_cameras else f"{cameras:,}"
-    thinned = recording.whole > problem.num_points
-    of = " of these points" if thinned else ""
-    return f"{of_cameras} images, {of_points}, {problem.num_observations:,} observations{of}"
-
-
-def worst_images(stage: Stage, count: int = WORST) -> list[tuple[str, int]]:
-    """The worst images: a line of text for each, and its number."""
-    measures = stage.measures
-    return [
-        (f"{measures.of_image[camera]:.3g} px: {stage.shown.name_of(camera)} ({measures.seen[camera]:,})", camera)
-        for camera in measures.worst()[:count].tolist()
-    ]
-
-
-def about_rows(stage: Stage) -> list[str]:
-    """For each residual besides those of pixels its colour, its cost and its worst rows, at the iteration shown."""
-    rows, lines = stage.problem.residuals.rows, []
-    for number, costs in enumerate(costs_of_rows(stage.problem) if rows else ()):
-        worst = ", ".join(f"{row} ({costs[row]:.3g})" for row in np.argsort(-costs, kind="stable")[:WORST_ROWS])
-        colour, name = KINDS[number % len(KINDS)], plain(rows[number].residual.name)
-        cost = f"cost {costs.sum():.5g} of {len(costs):,} rows; the worst: {worst}"
-        lines.append(f'<font color="rgb{colour}">●</font> **{name}**: {cost}')
-    return lines
-
-
-def about_image(stage: Stage, camera: int) -> str:
-    """How well an image fits."""
-    measures = stage.measures
-    rank = np.flatnonzero(measures.worst() == camera)
-    of = f", rank {rank[0] + 1} of {len(measures.worst())} from the worst" if len(rank) else ""
-    _, factor = geometry.residual_segments(stage.problem, stage.image_planes, measures.residuals, camera)
-    return (
-        f"**{plain(stage.shown.name_of(camera))}**: {measures.seen[camera]:,} observations, "
-        f"RMSE {measures.of_image[camera]:.3g} px{of}. Residuals are drawn {factor:.3g} times as long as they are, "
-        "from the measured pixel to the predicted one."
-    )
+        self._curve.data, self._curve.scales = curve_of(self.stages)
+        self._curve.visible = len(self._curve.data[0]) > 1
+        about = [words.about_image(stage, stage.chosen) for stage in self.stages if stage.chosen is not None]
+        about += [words.about_track(stage, stage.tracked) for stage in self.stages if stage.tracked is not None]
+        self._about.content = "\n\n".join(about) or "Click on an image or a point, or choose one of the worst images."

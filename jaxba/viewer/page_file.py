@@ -3,64 +3,83 @@
 from __future__ import annotations
 
 import html
+import json
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 from jaxba.io.files import StrPath, open_output
-from jaxba.viewer.page import heading, stages, start_server, stop_server, worst_images
+from jaxba.viewer.extra import HOST, quietly, viser
 from jaxba.viewer.sources import Shown
-from jaxba.viewer.stage import Stage
+from jaxba.viewer.stage import ASIDE, Stage
+from jaxba.viewer.words import meaning, numbers, sizes, worst_images
 
-PAGE_POINTS = 50_000
-"""Most points on a page in a file."""
+PAGE_POINTS, LISTED = 50_000, 5
+"""Most points on a page in a file, and worst images that it names."""
 
-FRAME_S = 1.0
-"""Seconds for which an iteration is shown while the page plays."""
+FRAME_S, LEFT = 1.0, 0.4
+"""Seconds for which an iteration is shown, and how far the view is moved to the left, where the words are."""
 
-LISTED = 5
-"""Worst images that the page names."""
+WORDS = """<details open style="position:fixed;left:8px;top:8px;max-width:24em;padding:4px 8px;font:12px sans-serif;
+color-scheme:light dark;background:Canvas;color:CanvasText;opacity:.85;z-index:9"><summary>jaxba</summary>%s</details>
+<script>setInterval(() => {
+    const time = Number(document.querySelector("[role=slider]")?.ariaValueNow ?? 0);
+    document.querySelectorAll("[data-numbers]").forEach(place => {
+        const numbers = JSON.parse(place.dataset.numbers);
+        place.textContent = numbers[Math.min(Math.floor(time / %g + 1e-6), numbers.length - 1)];
+    });
+}, 100)</script></body>"""
+"""What the scene cannot say, in a corner of the page: numbers of the iteration that its slider shows, and more."""
+
+
+def page_of(all_shown: Sequence[Shown]) -> str:
+    """A page that plays the iterations of all solves, in step; the worst image at the end is marked."""
+    server, words = quietly(viser.ViserServer, host=HOST, verbose=False), []
+    try:
+        drawn = stages(server, all_shown, PAGE_POINTS)
+        server.initial_camera.position -= (LEFT, 0, 0)
+        server.initial_camera.look_at -= (LEFT, 0, 0)
+        last = max(one.recording.last for one in all_shown)
+        told: list[list[str]] = [[] for _ in drawn]
+        for stage in drawn:
+            stage.load_images()
+            worst = worst_images(stage, LISTED)
+            stage.change(chosen=worst[0][1] if worst else None)
+            items = "".join(f"<li>{html.escape(text)}</li>" for text, _ in worst)
+            what = html.escape(f"{stage.shown.name}: {sizes(stage)}")
+            words.append(f"{what}<br>{meaning(stage)}<br>worst images, and observations:<ol>{items}</ol>")
+            stage.change(iteration=0)
+        film = server.get_scene_serializer()
+        for iteration in range(last + 1):
+            for stage, its in zip(drawn, told, strict=True):
+                if iteration:
+                    stage.change(iteration=iteration)
+                its.append(numbers(stage))
+            film.insert_sleep(FRAME_S if last else 0.0)
+        page = film.as_html().replace("darkMode:false", "darkMode:matchMedia('(prefers-color-scheme:dark)').matches", 1)
+    finally:
+        quietly(server.stop)
+    words += [f'<p><b data-numbers="{html.escape(json.dumps(its))}"></b></p>' for its in told]
+    title = html.escape(", ".join(one.name for one in all_shown))
+    page = page.replace("<title>Viser</title>", f"<title>jaxba: {title}</title>", 1)
+    return page.replace("</body>", WORDS % ("".join(words), FRAME_S), 1)
+
+
+def stages(server: viser.ViserServer, all_shown: Sequence[Shown], points: int, clicked: Any = None) -> list[Stage]:
+    """Draws problems and solves side by side, with at most so many points together, and turns the camera to them. A
+    click on an image calls `clicked` with the numbers of its stage and itself, and the event."""
+    share, found = max(points // len(all_shown), 1), []
+    for place, one in enumerate(all_shown):
+        click = None if clicked is None else partial(clicked, place)
+        found.append(Stage(server, one, place, share, click, len(all_shown) > 1))
+    middle = ASIDE * (len(all_shown) - 1) / 2
+    away = 2.2 + 1.2 * middle
+    server.initial_camera.position, server.initial_camera.look_at = (middle, -away, 0.7 * away), (middle, 0.0, 0.0)
+    return found
 
 
 def write_page(all_shown: Sequence[Shown], path: StrPath) -> None:
-    """Writes a page that plays the iterations of all solves, in step; the worst image at the end is marked. Raises
-    ProblemError: it cannot be written."""
-    server = start_server()
-    try:
-        drawn = stages(server, all_shown, points=PAGE_POINTS, caption="numbers")
-        for stage in drawn:
-            stage.load_images()
-            if len(worst := stage.measures.worst()):
-                stage.choose(int(worst[0]))
-        last = max(stage.shown.recording.last for stage in drawn)
-        summary = _summary(drawn)
-        for stage in drawn:
-            stage.show(0)
-        film = server.get_scene_serializer()
-        for iteration in range(1, last + 1):
-            film.insert_sleep(FRAME_S)
-            for stage in drawn:
-                stage.show(iteration)
-        if last:
-            film.insert_sleep(2 * FRAME_S)
-        page = film.as_html()
-    finally:
-        stop_server(server)
-    title = html.escape(", ".join(one.name for one in all_shown))
-    page = page.replace("<title>Viser</title>", f"<title>jaxba: {title}</title>", 1)
-    page = page.replace("</body>", f"{summary}</body>", 1)
+    """Writes a page to a file. Raises ProblemError: it cannot be written."""
+    page = page_of(all_shown)
     with open_output(path) as file:
         file.write(page.encode())
-
-
-def _summary(drawn: Sequence[Stage]) -> str:
-    """What the scene cannot say, in a corner of the page."""
-    parts = []
-    for stage in drawn:
-        parts.append(f"<p>{html.escape(heading(stage))}; {html.escape(stage.numbers())}")
-        if meaning := stage.limits_text():
-            parts.append(f"<br>points: {html.escape(stage.colour)}, {html.escape(meaning)}")
-        items = "".join(f"<li>{html.escape(text)}</li>" for text, _ in worst_images(stage, LISTED))
-        parts.append(f"<br>worst images, and observations:<ol>{items}</ol></p>")
-    style = (
-        "position:fixed;left:8px;top:8px;max-width:24em;padding:4px 8px;font:12px sans-serif;background:#fffc;z-index:9"
-    )
-    return f'<details open style="{style}"><summary>jaxba</summary>{"".join(parts)}</details>'

@@ -18,8 +18,8 @@ from jaxba.io.frames import Sidecar, read_sidecar
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.viewer.recording import ENDING, Recording, read_recording, still
 
-LARGEST_SIDE = 480
-"""Pixels of the longer side of an image on the page."""
+SMALL_SIDE = 480
+"""Pixels of the longer side of an image that is not chosen."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,19 @@ class Shown:
         """Width and height of an image, pixels; 0 if it is not at hand."""
         return self._opened(camera, lambda image: (float(image.width), float(image.height))) or (0.0, 0.0)
 
-    def image(self, camera: int) -> UInt8[np.ndarray, "height width 3"] | None:
-        """A small version of an image; None if it is not at hand."""
+    def image(self, camera: int, side: int = SMALL_SIDE) -> UInt8[np.ndarray, "height width 3"] | None:
+        """An image, its longer side at most so many pixels, with white margins that put its principal point in the
+        middle; None if it is not at hand."""
 
         def small(image: Any) -> np.ndarray:
-            image.draft("RGB", (2 * LARGEST_SIDE, 2 * LARGEST_SIDE))  # of a JPEG no more than is needed
-            image.thumbnail((LARGEST_SIDE, LARGEST_SIDE))
-            return np.asarray(image.convert("RGB"))
+            image.draft("RGB", (2 * side, 2 * side))  # of a JPEG no more than is needed
+            image.thumbnail((side, side))
+            pixels = np.asarray(image.convert("RGB"))
+            if self.looks is None or not self.looks.sizes[camera].all():
+                return pixels
+            lack = np.rint((1 - 2 * self.looks.principal[camera] / self.looks.sizes[camera]) * image.size).astype(int)
+            (left, top), (right, bottom) = np.maximum(lack, 0), np.maximum(-lack, 0)
+            return np.pad(pixels, ((top, bottom), (left, right), (0, 0)), constant_values=255)
 
         return self._opened(camera, small)
 

@@ -23,6 +23,7 @@ from jaxba.cli import table
 from jaxba.cli.solve import Arguments, run, solve_options, with_settings
 from jaxba.io import json_lines
 from jaxba.problem import geometry
+from jaxba.solver import progress
 from jaxba.solver.record import Record
 
 RECORD_KEYS = [
@@ -327,14 +328,14 @@ def test_a_start_without_a_finite_cost_is_reported(tmp_path, capsys):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_after_the_iteration_and_writes_the_solution(number, tiny, tmp_path, capsys, monkeypatch):
     output = tmp_path / "out.txt"
-    row = table.row
+    row = progress.row
 
     def interrupted(record, before):
         if record.iteration == 2:
             signal.raise_signal(number)
         return row(record, before)
 
-    monkeypatch.setattr(table, "row", interrupted)
+    monkeypatch.setattr(progress, "row", interrupted)
     before = signal.getsignal(number)
     assert run([str(tiny), "--ftol", "0", "--output", str(output)]) == 0
     printed = capsys.readouterr()
@@ -350,7 +351,7 @@ def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monk
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(table, "row", interrupted)
+    monkeypatch.setattr(progress, "row", interrupted)
     before = signal.getsignal(signal.SIGINT)
     assert run([str(tiny), "--output", str(tmp_path / "out.txt")]) == 130
     assert capsys.readouterr().err.splitlines()[1:] == ["interrupted"]

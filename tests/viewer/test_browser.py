@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import socket
 import threading
 import time
 from pathlib import Path
@@ -71,10 +70,7 @@ def viewer(recording, browser):
     from jaxba.viewer.page import Viewer
     from jaxba.viewer.sources import shown
 
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    found = Viewer([shown(recording, "run")], port)
+    found = Viewer([shown(recording, "run")])
     for log in ("browser", "performance"):
         browser.get_log(log)  # what went before
     yield found
@@ -166,35 +162,106 @@ def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, v
     wait_for(lambda: "start, cost" in browser.find_element(By.TAG_NAME, "body").text, browser)
     wait_for(lambda: (np.abs(scene(browser) - last).max(axis=2) > 60).sum() > 200, browser)
     recorded = viewer.stages[0].shown.recording.cost
-    iterations, cost, shown = viewer._curve.data
+    iterations, excess, shown = viewer._curve.data
     np.testing.assert_array_equal(iterations, np.arange(len(recorded)))
-    np.testing.assert_array_equal(cost, recorded)
-    np.testing.assert_array_equal(shown, [recorded[0], *[np.nan] * (len(recorded) - 1)])
+    np.testing.assert_allclose(10 ** excess[:-1], recorded[:-1] / recorded.min() - 1)
+    assert excess[-1] == pytest.approx(excess[-2] - 1)  # a tenth of the least above stands for zero
+    np.testing.assert_array_equal(shown, [excess[0], *[np.nan] * (len(recorded) - 1)])
     check_silent(browser, viewer.url, viewer.url.replace("http", "ws"))
 
 
-def test_a_click_on_a_frustum_marks_its_points(browser, viewer):
-    from selenium.webdriver.common.action_chains import ActionChains
-    from selenium.webdriver.common.by import By
+def screen(viewer, place) -> tuple[int, int]:
+    """The pixel of a place on the page in the view of the one who looks."""
+    from scipy.spatial.transform import Rotation
 
+    (client,) = viewer.server.get_clients().values()
+    view = client.camera
+    x, y, z = Rotation.from_quat(view.wxyz, scalar_first=True).inv().apply(place - view.position)
+    focal = view.image_height / 2 / np.tan(view.fov / 2)
+    return round(view.image_width / 2 + focal * x / z), round(view.image_height / 2 + focal * y / z)
+
+
+def click(browser, at: tuple[int, int]) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    body = browser.find_element("tag name", "body")
+    middle = body.size["width"] // 2, body.size["height"] // 2
+    ActionChains(browser).move_to_element_with_offset(body, at[0] - middle[0], at[1] - middle[1]).click().perform()
+
+
+def test_clicks_move_into_a_camera_and_show_the_track_of_a_point(browser, viewer):
     browser.get(viewer.url)
     before = like(settled(browser), ORANGE)
-    body = browser.find_element(By.TAG_NAME, "body")
-    chosen = lambda: viewer.stages[0].chosen is not None
-    colours = {tuple(handle.color) for handle in viewer.stages[0].layers.frusta.values()}
-    pixels = scene(browser)
-    near = np.min([np.abs(pixels - np.array(colour)).max(axis=2) for colour in colours], axis=0) < 25
-    rows, columns = np.nonzero(near)
-    middle = body.size["width"] // 2, body.size["height"] // 2
-    for at in range(0, len(rows), max(len(rows) // 40, 1)):
-        x, y = int(columns[at]), int(rows[at])
-        ActionChains(browser).move_to_element_with_offset(body, x - middle[0], y - middle[1]).click().perform()
-        time.sleep(0.4)
-        if chosen():
+    text = lambda: browser.find_element("tag name", "body").text
+    (stage,) = viewer.stages
+    (client,) = viewer.server.get_clients().values()
+    start = client.camera.position
+    for camera in stage.frusta.tolist():  # some are outside of the window, or behind another
+        pose, _, depth = stage.view_of(camera)
+        click(browser, screen(viewer, pose[:, 3] + 0.9 * depth * pose[:, 2]))
+        time.sleep(1.0)
+        if stage.chosen is not None:
             break
-    assert chosen(), "no frustum was hit"
+    assert stage.chosen is not None, "no frustum was hit"
+    wait_for(lambda: "times as long as they are, in all images" in text(), browser)
     wait_for(lambda: like(scene(browser), ORANGE) > before + 100, browser)
-    wait_for(lambda: "observations, RMSE" in body.text, browser)
+    pose, half, _ = stage.view_of(stage.chosen)
+    np.testing.assert_allclose(client.camera.position, pose[:, 3], atol=1e-6)
+    assert np.tan(client.camera.fov / 2) >= half[1]
+    assert viewer._listed[viewer._picked.value] == (stage, stage.chosen)
+    assert viewer._picked.value in browser.page_source
+
+    viewer.choose(stage, None, client)
+    np.testing.assert_allclose(client.camera.position, start, atol=1e-6)
+    settled(browser)
+    point = int(np.argmax(stage.measures.tracks))
+    place = stage._similarity.points(np.asarray(stage.problem.points))[point]
+    stage.change(enlarged=0.1)  # so that no frustum is before it
+    settled(browser)
+    click(browser, screen(viewer, place))
+    wait_for(lambda: "the worst:" in text(), browser)
+    assert stage.tracked is not None
+    lines = stage.layers._nodes["track lines"].points
+    assert len(lines) == stage.measures.tracks[stage.tracked]
+    check_silent(browser, viewer.url, viewer.url.replace("http", "ws"))
+
+
+def test_points_are_left_out_by_error_and_track_length(viewer):
+    (stage,) = viewer.stages
+    measures, limit = stage.measures, float(np.median(stage.measures.of_point))
+    stage.change(errors=(limit, np.inf), lengths=(3, 5))
+    expected = np.flatnonzero((measures.of_point >= limit) & (measures.tracks >= 3) & (measures.tracks <= 5))
+    np.testing.assert_array_equal(stage.kept(), expected)
+    assert len(stage.layers._nodes["points"].points) == len(expected)
+
+
+def test_play_goes_through_the_iterations_and_a_picture_is_saved(browser, viewer, monkeypatch):
+    import viser
+
+    from jaxba.viewer import page
+
+    monkeypatch.setattr(page, "FRAME_S", 0.0)
+    viewer._run()
+    last = viewer.stages[0].shown.recording.last
+    assert (viewer._slider.value, viewer.stages[0].iteration, viewer._playing) == (last, last, False)
+    browser.get(viewer.url)
+    settled(browser)
+    (client,) = viewer.server.get_clients().values()
+    sent = {}
+    monkeypatch.setattr(client, "send_file_download", lambda name, data, **_: sent.update({name: data}))
+    viewer._save(viser.GuiEvent(client=client, client_id=client.client_id, target=viewer._play))
+    from PIL import Image
+
+    assert coloured(np.asarray(Image.open(io.BytesIO(sent["jaxba.png"])), np.int16)) > 500
+
+
+def test_a_notebook_holds_a_page_without_a_server(browser, viewer, tmp_path):
+    page = viewer._repr_html_()
+    viewer.server.stop()
+    path = tmp_path / "notebook.html"
+    path.write_text(page)
+    browser.get(f"file://{path}")
+    wait_for(lambda: coloured(scene(browser)) > 500, browser)
 
 
 def test_a_page_in_a_file_plays_without_a_server(browser, recording, tmp_path):
@@ -210,7 +277,10 @@ def test_a_page_in_a_file_plays_without_a_server(browser, recording, tmp_path):
     wait_for(lambda: coloured(scene(browser)) > 500, browser)
     first = scene(browser)
     wait_for(lambda: (np.abs(scene(browser) - first).max(axis=2) > 60).sum() > 200, browser)
-    assert "worst images" in browser.find_element("tag name", "body").text
+    text = lambda: browser.find_element("tag name", "body").text
+    assert "worst images" in text()
+    wait_for(lambda: f"iteration {recording.last} of {recording.last}, cost" in text(), browser)
+    wait_for(lambda: "start, cost" in text(), browser)
     check_silent(browser, "file://")
 
 
@@ -249,8 +319,9 @@ def test_slider_and_curve_come_with_the_first_iteration(recording):
 def test_residuals_are_segments_of_a_colour_for_each_and_their_worst_rows_are_listed(recording):
     from jaxba import residuals
     from jaxba.model.registration import costs_of_rows
-    from jaxba.viewer.page import Viewer, about_rows
+    from jaxba.viewer.page import Viewer
     from jaxba.viewer.sources import shown
+    from jaxba.viewer.words import about_rows
 
     problem = recording.problem
     bars = residuals.distance(point=[0, 1, 2], point_2=[3, 4, 5], length=[0.0, 50.0, 0.0], sigma=0.1)
@@ -279,6 +350,6 @@ def test_the_command_says_what_is_missing(tmp_path, capsys):
 
 
 def test_names_are_characters_and_nothing_else():
-    from jaxba.viewer.page import plain
+    from jaxba.viewer.words import plain
 
     assert plain("<b>*a*_1") == r"&lt;b&gt;\*a\*\_1"

@@ -8,7 +8,8 @@ import pytest
 import jaxba
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.viewer.geometry import depth_of_image, frusta_of, residual_segments, to_page
+from jaxba.problem.similarity import upright
+from jaxba.viewer.geometry import depth_of_image, frusta_of, residual_segments
 from jaxba.viewer.measures import measure
 
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
@@ -32,7 +33,7 @@ def pinhole_problem(model: str) -> BundleProblem:
 def test_corners_of_a_frustum_project_to_the_corners_of_the_image(model):
     problem = pinhole_problem(model)
     frusta, poses = frusta_of(problem), geometry.camera_poses(np.asarray(problem.cameras))
-    depth = depth_of_image(frusta.half, 0.2)
+    depth = np.array([depth_of_image(half, 0.2) for half in frusta.half])
     plane = np.concatenate([CORNERS * frusta.half[:, None], np.ones((2, 4, 1))], axis=2) * depth[:, None, None]
     corners = np.einsum("nij,nkj->nki", poses[:, :, :3], plane) + poses[:, None, :, 3]
     placed = problem.replace(points=corners.reshape(-1, 3))
@@ -48,15 +49,23 @@ def test_a_segment_runs_from_the_measured_towards_the_predicted_pixel(model):
     problem = pinhole_problem(model)
     predicted = problem.observations + np.array([3.0, -2.0])
     frusta = frusta_of(problem)
-    segments, factor = residual_segments(problem, frusta, problem.observations - predicted, 1)
+    factor = 7.0
+    segments = residual_segments(problem, frusta, problem.observations - predicted, 1, factor)
     ends = frusta.on_plane(np.asarray(problem.observations)[4:] + factor * np.array([3.0, -2.0]), np.ones(4, int))
     np.testing.assert_allclose(segments[:, 1], ends)
-    assert factor == pytest.approx(0.05 * 640 / np.hypot(3, 2))
+
+
+def test_a_large_residual_ends_outside_of_the_image_but_not_far():
+    problem = pinhole_problem("PINHOLE")
+    frusta, residuals = frusta_of(problem), np.full((8, 2), 1e9)
+    start, end = residual_segments(problem, frusta, residuals, 0, 1.0).transpose(1, 0, 2)
+    assert (np.abs(end) > frusta.half[0]).any(axis=1).all()
+    np.testing.assert_allclose(np.linalg.norm((end - start) * frusta.focal[0], axis=1), np.hypot(640, 480))
 
 
 def test_on_the_page_cameras_stand_upright_around_the_origin():
     problem = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=60), 3)
-    similarity = to_page(problem)
+    similarity = upright(problem)
     poses = similarity.poses(geometry.camera_poses(np.asarray(problem.cameras)))
     np.testing.assert_allclose(np.linalg.det(poses[:, :, :3]), 1.0)
     up = -poses[:, :, 1].mean(axis=0)

@@ -56,7 +56,6 @@ def test_colours_and_sizes_are_those_that_pycolmap_reads(model, tmp_path):
         ((), "name a problem"),
         (("no.npz",), "cannot read no.npz"),
         (("no.txt", "--images", "nowhere"), "--images nowhere: is no folder"),
-        (("no.txt", "--port", "0"), "--port must lie"),
     ],
 )
 def test_jaxba_view_says_in_one_line_what_is_wrong(words, message, capsys, monkeypatch):
