@@ -31,7 +31,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
-from jaxba.runtime.compilation import compile_and_run, program, quick_runs
+from jaxba.runtime.compilation import compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.place import check_problem, placed
@@ -48,6 +48,10 @@ fitted."""
 
 EQUIVALENT_STEPS = (1 + len(START_DISTANCES)) * POINT_ITERATIONS // 3
 """Accept decisions with three point iterations each that take as long as a search, to choose the compilation level."""
+
+BREAK_EVEN = 3_000_000
+"""Observations times accept decisions after which a better program has paid for its compilation, as
+`benchmarks.compilation` measures it."""
 
 MIN_RELATIVE_GAIN = 1e-3
 """Smallest decrease for which a point is moved, relative to its own cost: less means the same minimum. Chosen once, not
@@ -114,7 +118,7 @@ def retriangulate_without(
         origin = np.zeros((3, len(order)))
         centers = geometry.camera_centers(counted.cameras) - offset
         origin[:, real] = centers[first[order[real]]].T
-        level = "quick" if quick_runs("acceptance", here.num_observations) > EQUIVALENT_STEPS else "full"
+        level = "quick" if EQUIVALENT_STEPS * here.num_observations < BREAK_EVEN else "full"
         search = program(_search, "loss", level=level)
         arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
         found, moved, before, after = jax.device_get(compile_and_run(search, *arguments))

@@ -44,31 +44,24 @@ QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitt
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
 """The option that switches XLA's newer kernel emitters off."""
 
-Part = Literal["factorization", "iterative", "acceptance", "cameras"]
-"""What is compiled by itself: a linear solve by factorisation or by an iterative method, the test whether its step is
-accepted, or the camera rounds of a step that is not."""
+Kind = Literal["factorization", "iterative"]
+"""How a step solves its linear system."""
 
 COMPILE_EVENTS = "/jax/core/compile/"
 """Prefix of the durations that JAX reports while it traces, lowers and compiles."""
 
-BREAK_EVEN: dict[Part, int] = {
-    "factorization": 1_200_000,
-    "iterative": 1_000_000,
-    "acceptance": 3_000_000,
-    "cameras": 3_000_000,
-}
-"""Observations times runs after which a better program has paid for its compilation, as `benchmarks.compilation`
-measures it."""
+BREAK_EVEN: dict[Kind, int] = {"factorization": 1_200_000, "iterative": 1_000_000}
+"""Observations times iterations after which better programs have paid for their compilation, as
+`benchmarks.compilation` measures it. Those of a step are compiled side by side, and so take as long as the first."""
 
-TYPICAL: dict[Part, int] = {"factorization": 5, "iterative": 8, "acceptance": 20, "cameras": 20}
-"""Runs that a solve may well take: quick programs that would not last so long are left out. Of fifteen real problems
-nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
+TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}
+"""Iterations that a solve may well take: quick programs that would not last so long are left out."""
 
 
-def quick_runs(part: Part, observations: int) -> int:
-    """How often a part of a step is run before it is compiled fully."""
-    runs = BREAK_EVEN[part] // max(1, observations)
-    return runs if runs >= TYPICAL[part] else 0
+def quick_iterations(kind: Kind, observations: int) -> int:
+    """How many iterations are run before a step is compiled fully."""
+    count = BREAK_EVEN[kind] // max(1, observations)
+    return count if count >= TYPICAL[kind] else 0
 
 
 @functools.cache

@@ -27,7 +27,7 @@ from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices,
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.progress import shown
-from jaxba.solver.stepwise import Stepwise, quick_runs_of
+from jaxba.solver.stepwise import Stepwise, iterations_before
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
 
@@ -240,8 +240,8 @@ def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: boo
     arguments = setup, options.tolerances, options.max_iterations, clock
     if setup.shards is not None:
         return OnDevices(setup.shards, *arguments)
-    first = quick_runs_of(options.compilation, len(setup.placed.here.camera_index), setup.options)
-    if options.max_iterations and (any(first.values()) or not alone):
+    first = iterations_before(options.compilation, len(setup.placed.here.camera_index), setup.options)
+    if options.max_iterations and (first or not alone):
         return Stepwise(first, *arguments)
     return Compiled(*arguments)
 

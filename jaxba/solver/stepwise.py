@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +32,9 @@ from jaxba.runtime.compilation import (
     Compilation,
     Level,
     ParallelCompilation,
-    Part,
-    Program,
     compiler_options,
     program,
-    quick_runs,
+    quick_iterations,
 )
 from jaxba.solver.drivers import Driver
 from jaxba.solver.iteration import Carry, advance, begin, problem_info
@@ -48,7 +45,7 @@ WORTH_S = 0.15
 shortest call."""
 
 NEVER = sys.maxsize
-"""Runs of a quick program after which a better one is compiled, if it never is."""
+"""Iterations before a step is fully optimised, if it never is."""
 
 Call = Callable[..., Any]
 """Runs a program with these arguments, or compiles it for them."""
@@ -57,22 +54,15 @@ Call = Callable[..., Any]
 class Stepwise(Driver):
     """Iterations one at a time on one device, of programs at their own levels."""
 
-    def __init__(self, first: Mapping[str, int], *arguments: Any) -> None:
-        """`first` are runs of each part of a step before it is fully optimised (`quick_runs_of`); other arguments as
-        for `Driver`."""
+    def __init__(self, first: int, *arguments: Any) -> None:
+        """`first` are the iterations before the step is fully optimised (`iterations_before`); other arguments as for
+        `Driver`."""
         super().__init__(*arguments)
-        self._first, self._runs = first, Counter[str]()
-        self._levels = self._levels_now()
-        self._wanted: dict[str, Wanted] = {}  # fully optimised programs of which the quick ones were run
-        self._seen, self._ran_quick, self._quick_s = set[str](), False, 0.0
+        self._first, self._done = first, 0
+        self._stored: dict[str, bool] = {}  # whether the fully optimised program of a part is on disk
+        self._wanted: list[Wanted] = []  # those of which the quick ones were run
+        self._ran_quick, self._quick_s = False, 0.0
         self._programs, self._compile_s = ParallelCompilation(), 0.0
-
-    def _levels_now(self) -> dict[str, Level]:
-        return {name: "quick" if self._runs[name] < runs else "full" for name, runs in self._first.items()}
-
-    def _run(self, function: Program, *arguments: Any) -> Any:
-        self._runs[function.function.__name__] += 1
-        return self._programs.run(function, *arguments)
 
     def compile_s(self) -> float:
         """See `Driver`."""
@@ -83,22 +73,23 @@ class Stepwise(Driver):
         began, setup = time.perf_counter(), self.setup
         with self._programs as compile_programs:
             self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
-        state = jax.block_until_ready(setup.initial(self._run))
-        self.carry = jax.block_until_ready(self._begin(self._run, state))
+        state = jax.block_until_ready(setup.initial(self._programs.run))
+        self.carry = jax.block_until_ready(self._begin(self._programs.run, state))
         if self.clock.seconds > 0 or self._programs.loaded:
             self._compile_s = time.perf_counter() - began - self._programs.late_s
         return state
 
     def iterate(self) -> tuple[StepInfo, Termination]:
         """One iteration: its record, of Python scalars, and whether it ended the solve."""
-        if self._levels != (now := self._levels_now()):
-            self._levels, began = now, time.perf_counter()
+        if self._done == self._first > 0:
+            began = time.perf_counter()
             with self.compiling(), self._programs:
                 self._iterate(self._programs, self.carry)
             self._compile_s += time.perf_counter() - began
         self._ran_quick, began = False, time.perf_counter()
-        self.carry, step, report = self._iterate(self._run, self.carry)
+        self.carry, step, report = self._iterate(self._programs.run, self.carry)
         unpacked = _unpack(report, step)
+        self._done += 1
         if self._ran_quick:
             self.quick_iterations += 1
             self._quick_s += time.perf_counter() - began
@@ -106,23 +97,22 @@ class Stepwise(Driver):
 
     def end(self) -> None:
         """See `Driver`."""
-        if self._quick_s > WORTH_S and (wanted := [one for one in self._wanted.values() if not one.path.exists()]):
+        if self._quick_s > WORTH_S and (wanted := [one for one in self._wanted if not one.path.exists()]):
             compile_later(wanted)
 
     def _part(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, ...]:
         """The program of a part of the step at its level, and its arguments. A fully optimised one that is on disk is
         taken; one that is not is noted."""
-        name = function.__name__
-        if name not in self._seen and 0 < self._first[name] < NEVER:
-            self._seen.add(name)
-            path = self._programs.path(program(function, "options"), *arguments)
-            if path and path.exists():
-                self._first = {**self._first, name: 0}
-                self._levels = self._levels_now()
-            elif path:
-                self._wanted[name] = Wanted(function, outline(arguments), path)
-        self._ran_quick |= self._levels[name] == "quick"
-        return program(function, "options", level=self._levels[name]), *arguments
+        name, level = function.__name__, "quick" if self._done < self._first else "full"
+        if level == "quick" and self._first < NEVER:
+            if name not in self._stored:
+                path = self._programs.path(program(function, "options"), *arguments)
+                self._stored[name] = bool(path and path.exists())
+                if path and not self._stored[name]:
+                    self._wanted.append(Wanted(function, outline(arguments), path))
+            level = "full" if self._stored[name] else level
+        self._ran_quick |= level == "quick"
+        return program(function, "options", level=cast(Level, level)), *arguments
 
     def _begin(self, call: Call, state: LMState) -> Carry:
         """The carry before the first iteration, from the initial state."""
@@ -151,25 +141,13 @@ class Stepwise(Driver):
         return carry._replace(state=state), step, report
 
 
-def parts_of(options: StepOptions) -> dict[str, Part]:
-    """The parts into which a step with these options is compiled, by the names of their functions."""
-    found: dict[str, Part] = {}
-    factors = options.forms_reduced_system and options.truncated is None
-    found[propose.__name__] = "factorization" if factors else "iterative"
-    found[(try_candidate if has_repairs(options) else try_step).__name__] = "acceptance"
-    if options.refinement.camera_rounds:
-        found[camera_round.__name__] = "cameras"
-    return found
-
-
-def quick_runs_of(compilation: Compilation, observations: int, options: StepOptions) -> dict[str, int]:
-    """How often each part of a step is run before it is fully optimised."""
-    parts = parts_of(options)
+def iterations_before(compilation: Compilation, observations: int, options: StepOptions) -> int:
+    """How many iterations are run before a step is fully optimised."""
     if compilation == "full" or not compiler_options("quick"):
-        return dict.fromkeys(parts, 0)
-    if compilation == "quick":
-        return dict.fromkeys(parts, NEVER)
-    return {name: quick_runs(part, observations) for name, part in parts.items()}
+        return 0
+    factors = options.forms_reduced_system and options.truncated is None
+    kind = "factorization" if factors else "iterative"
+    return NEVER if compilation == "quick" else quick_iterations(kind, observations)
 
 
 NOTHING, CANDIDATE, CAMERA_ROUND = range(3)

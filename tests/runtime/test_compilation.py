@@ -22,13 +22,13 @@ from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
     BREAK_EVEN,
     TYPICAL,
+    Kind,
     Level,
     ParallelCompilation,
-    Part,
     Program,
     compiler_options,
     program,
-    quick_runs,
+    quick_iterations,
 )
 from jaxba.solver.stepwise import try_step_by_parts
 
@@ -37,12 +37,12 @@ pytestmark = pytest.mark.step
 on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU has lower levels")
 
 
-@pytest.mark.parametrize("part", get_args(Part))
-def test_more_observations_mean_fewer_quick_runs(part):
-    even, typical = BREAK_EVEN[part], TYPICAL[part]
-    assert [quick_runs(part, count) for count in (1, 100, even // typical)] == [even, even // 100, typical]
-    assert quick_runs(part, even // (typical - 1)) == quick_runs(part, 10**9) == 0
-    assert quick_runs(part, 31_843) > 12, "Ladybug-49 converges before that"
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_more_observations_mean_fewer_quick_iterations(kind):
+    even, typical = BREAK_EVEN[kind], TYPICAL[kind]
+    assert [quick_iterations(kind, count) for count in (1, 100, even // typical)] == [even, even // 100, typical]
+    assert quick_iterations(kind, even // (typical - 1)) == quick_iterations(kind, 10**9) == 0
+    assert quick_iterations(kind, 31_843) > 12, "Ladybug-49 converges before that"
 
 
 @on_a_cpu
@@ -188,8 +188,7 @@ def test_nothing_more_is_compiled_after_an_error():
 def test_the_optimised_program_takes_over_and_the_records_go_on(watched, monkeypatch):
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
-    before = {"factorization": 1, "acceptance": 2}
-    monkeypatch.setattr("jaxba.solver.stepwise.quick_runs", lambda part, _: before[part])
+    monkeypatch.setattr("jaxba.solver.stepwise.quick_iterations", lambda kind, _: 2)
     records = []
     callback = records.append if watched else None
     mixed = solve(support.tiny(), "ceres", compilation="auto", callback=callback)
@@ -254,6 +253,6 @@ def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkey
     assert " (all with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
     assert run([*fast, "--compilation", "full"]) == 0
     assert "quickly" not in capsys.readouterr().out
-    monkeypatch.setattr("jaxba.solver.stepwise.quick_runs", lambda part, _: 1)
+    monkeypatch.setattr("jaxba.solver.stepwise.quick_iterations", lambda kind, _: 1)
     assert run(fast) == 0
     assert " (1 of them with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out

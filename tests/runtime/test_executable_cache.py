@@ -364,7 +364,7 @@ def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
 
 
 def test_programs_of_both_levels_are_stored(folder, monkeypatch):
-    monkeypatch.setattr("jaxba.solver.stepwise.quick_runs", lambda part, _: 1)
+    monkeypatch.setattr("jaxba.solver.stepwise.quick_iterations", lambda kind, _: 1)
     once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
     first = once()
     assert first.quick_iterations == 1
