@@ -171,7 +171,7 @@ def rows(runs: dict[str, dict[str, Any]], names: list[str], first: str) -> Itera
             better = np.min([prices[y] for y in YARDSTICKS if y in prices] or [theirs], axis=0)
             known = np.isfinite(better) & np.isfinite(mine)
             worst = float(np.max(mine[known] / better[known])) if known.any() else np.nan
-            ratio, low, high = paired_ratio(mine[both], theirs[both])
+            ratio, low, high = paired_ratio(mine[both], theirs[both]) if both.any() else (np.nan,) * 3
             cells.append(f"{ratio:.2f} [{low:.2f}, {high:.2f}] {int(np.sum(~np.isfinite(mine))):2d} {worst:4.1f}")
         above = np.array([found[name]["final"] / best[p] - 1 for p, found in runs.items()])
         ends = f"{np.mean(above > 1e-3):4.0%} {np.mean(above > 1e-2):4.0%} {above.max():7.4f}"

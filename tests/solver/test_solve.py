@@ -277,7 +277,7 @@ def test_convergence_comes_before_the_wish_to_stop():
 def test_every_end_has_a_reason_for_a_person():
     reasons = [end.reason for end in Termination]
     assert len(set(reasons)) == len(reasons)
-    tests = {Termination.COST, Termination.STEP, Termination.GRADIENT, Termination.ROUNDING}
+    tests = {Termination.COST, Termination.STEP, Termination.GRADIENT, Termination.ROUNDING, Termination.WITHIN}
     assert {end for end in Termination if end.converged} == tests
 
 
