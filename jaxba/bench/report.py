@@ -1,4 +1,4 @@
-"""Writes the results of a benchmark: a summary, a page that needs no other file, and a picture of the profiles."""
+"""Writes the results of a benchmark: a summary, a page that needs no other file, tables, a picture of the profiles."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from jaxba.bench import page, profile
 from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
 from jaxba.bench.pictures import save_picture
 from jaxba.bench.summary import Summary, summarize, write_summary
-from jaxba.bench.tables import problem_table, tables
+from jaxba.bench.tables import as_text, problem_table, tables
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
+
+FILES = ("summary.json", "report.html", "tables.txt", "profile.png")
+"""What `write_all` writes."""
 
 
 def write_all(
@@ -24,7 +27,7 @@ def write_all(
     *,
     metadata: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Writes `summary.json`, `report.html` and `profile.png` into a folder and returns their paths.
+    """Writes `summary.json`, `report.html`, `tables.txt` and `profile.png` into a folder and returns their paths.
 
     Existing files are replaced. The picture has the performance profile at the tolerance, by iterations and by time.
 
@@ -46,11 +49,12 @@ def write_all(
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize(records, tolerance, metadata or run_metadata(records))
-    files = [folder / "summary.json", folder / "report.html", folder / "profile.png"]
+    files = [folder / name for name in FILES]
     write_summary(files[0], summary)
     write_text(files[1], to_html(records, summary, tolerance))
     styles = solver_styles(profile.solver_names(records))
-    save_picture(profile_chart(records, profile.Target("tau", tolerance), styles), files[2])
+    write_text(files[2], as_text([*tables(summary), problem_table(summary)]))
+    save_picture(profile_chart(records, profile.Target("tau", tolerance), styles), files[3])
     return files
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -42,13 +44,31 @@ def percentage(fraction: float) -> str:
     return "-" if math.isnan(fraction) else f"{100 * fraction:.0f} %"
 
 
-def tables(summary: Summary, details: bool = True) -> list[Table]:
-    """All tables of a summary; with `details` also the one with a row for each pair of problem and solver."""
+def compact(summary: Summary) -> Table:
+    """What is worth knowing of every solver, in 100 columns."""
+    header = ("solver", "iterations\nto 0.1 %", "seconds\nto 0.1 %", "reached", "iterations\nto the end")
+    rows = []
+    for s in summary.solvers:
+        near, end = s.targets["relative_0.001"], s.targets["converged"]
+        counts = [f"{one.reached}/{one.total}" for one in (near, end)]
+        means = [number(x) for x in (near.iterations_capped, near.seconds, end.iterations_capped)]
+        ends = counts[1], number(s.final_ratio_worst, 5), f"{s.compile_s:.1f}"
+        rows.append((s.solver, *means[:2], counts[0], means[2], *ends))
+    note = (
+        "0.1 %: above the best cost that any solver reached. Geometric means over problems; a failure counts as "
+        f"{profile.ITERATION_LIMIT} iterations, and not in the seconds. A program that several solvers or problems "
+        "share is compiled for the first one."
+    )
+    return Table("", (*header, "converged", "worst end\n/ best", "seconds of\ncompiling"), rows, note)
+
+
+def tables(summary: Summary) -> list[Table]:
+    """All other tables of a summary."""
     found = [_overview(summary), *_reach_tables(summary)]
     found += [
         _against(summary, yardstick) for yardstick in YARDSTICKS if any(yardstick in s.against for s in summary.solvers)
     ]
-    return [*found, _details(summary)] if details else found
+    return [*found, _details(summary)]
 
 
 def _overview(summary: Summary) -> Table:
@@ -66,7 +86,7 @@ def _overview(summary: Summary) -> Table:
         f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
         "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
         f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): fractions of all iterations. "
-        f"Seconds per iteration and compilation: medians over problems."
+        "Seconds per iteration: median over problems; of compilation: sum over all runs."
     )
     return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
 
@@ -137,24 +157,42 @@ def problem_table(summary: Summary) -> Table:
     return Table("Problems and their sizes", header, rows, note, text_columns=2)
 
 
-def print_summary(summary: Summary, console: Console, details: bool = True) -> None:
-    """Prints all tables to a rich console, warnings first."""
+def print_summary(summary: Summary, console: Console) -> None:
+    """Prints the compact table to a rich console, warnings first."""
     from rich.text import Text
 
     for warning in summary.warnings:
         console.print(Text(f"warning: {warning}", style="yellow"))
-    for table in tables(summary, details):
-        console.print(to_rich(table))
+    console.print(to_rich(compact(summary)))
 
 
 def to_rich(table: Table) -> RichTable:
     """The table for a rich console."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    drawn = RichTable(title=Text(table.title), caption=Text(table.note), title_justify="left", caption_justify="left")
+    drawn = RichTable(
+        title=Text(table.title) if table.title else None,
+        caption=Text(table.note),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
     for i, name in enumerate(table.header):
         drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
     for row in table.rows:
         drawn.add_row(*(Text(cell) for cell in row))
     return drawn
+
+
+def as_text(found: Sequence[Table]) -> str:
+    """Tables one below the other, their lines as long as they need to be."""
+    from rich.console import Console
+
+    with io.StringIO() as stream:
+        console = Console(file=stream, width=200, markup=False, emoji=False)
+        for table in found:
+            console.print(to_rich(table))
+        return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"

@@ -69,8 +69,9 @@ def page_of(records, tolerance=1e-3, **metadata):
 def test_write_all_writes_the_documented_files(tmp_path):
     records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
     files = write_all(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
-    assert names(tmp_path / "out") == {"summary.json", "report.html", "profile.png"} == {path.name for path in files}
-    assert files[2].read_bytes().startswith(b"\x89PNG")
+    wanted = {"summary.json", "report.html", "tables.txt", "profile.png"}
+    assert names(tmp_path / "out") == wanted == {path.name for path in files}
+    assert files[3].read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_picture_of_a_profile_has_the_curves_of_the_chart():

@@ -17,10 +17,12 @@ import jaxba
 from jaxba import write_bal
 from jaxba.bench import report
 from jaxba.bench import run as bench_run
+from jaxba.bench.sources import default_sources
 from jaxba.cli.bench import run
 from jaxba.damping.learned import without_weights
 from jaxba.damping.registry import SHIPPED
 from jaxba.problem import geometry
+from jaxba.structure.padding import capacity_of
 
 KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
@@ -213,6 +215,23 @@ def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undra
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
 
 
+def test_another_command_gets_a_folder_of_its_own_and_the_same_one_goes_on(tmp_path, undrawn, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    brief, places = ["scene:tiny", "--repeats", "1", "--max-iterations", "1", "--solvers"], Path("runs")
+    assert run([*brief, "ceres"]) == run([*brief, "classic"]) == run([*brief, "ceres"]) == 0
+    assert [line["solver"] for line in lines(places / "bench")] == ["ceres"]
+    assert [line["solver"] for line in lines(places / "bench-2")] == ["classic"]
+    (places / "bench" / "results.jsonl").write_text("damaged\n")
+    assert run([*brief, "ceres"]) == 0
+    assert [line["solver"] for line in lines(places / "bench-3")] == ["ceres"]
+
+
+def test_the_default_scenes_share_programs():
+    capacities = {capacity_of(source.read()) for source in default_sources()}
+    assert len(capacities) == 1
+    assert None not in capacities
+
+
 def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(2 * path.read_bytes())
@@ -283,7 +302,7 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
     assert bench(tmp_path / "run[bold]", *argv) == 0
     out = capsys.readouterr().out
-    assert "\nseq[red]:cat: ceres #1: 1 iteration," in f"\n{out}"
+    assert "\nseq[red]:cat:: 1 run in " in f"\n{out}"
     assert str(tmp_path / "run[bold]" / "report.html") in out
 
 
