@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jaxba.bench import profile
-from jaxba.bench.summary import YARDSTICKS, Summary
-from jaxba.game.statistics import Comparison
+from jaxba.bench.summary import Summary
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,39 +56,11 @@ def compact(summary: Summary) -> Table:
         f"{profile.ITERATION_LIMIT} iterations, and not in the seconds. A program that several solvers or problems "
         "share is compiled for the first one."
     )
-    return Table("", (*header, "converged", "worst end\n/ best", "seconds of\ncompiling"), rows, note)
+    return Table("Solvers", (*header, "converged", "worst end\n/ best", "seconds of\ncompiling"), rows, note)
 
 
-def tables(summary: Summary) -> list[Table]:
-    """All other tables of a summary."""
-    found = [_overview(summary), *_reach_tables(summary)]
-    found += [
-        _against(summary, yardstick) for yardstick in YARDSTICKS if any(yardstick in s.against for s in summary.solvers)
-    ]
-    return [*found, _details(summary)]
-
-
-def _overview(summary: Summary) -> Table:
-    header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
-    rows = []
-    for s in summary.solvers:
-        end = s.targets["converged"]
-        means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
-        fractions = (percentage(s.rejected_share), percentage(s.linear_failure_share))
-        ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
-        rows.append(
-            (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *fractions, number(s.compile_s))
-        )
-    note = (
-        f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
-        "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
-        f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): fractions of all iterations. "
-        "Seconds per iteration: median over problems; of compilation: sum over all runs."
-    )
-    return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
-
-
-def _reach_tables(summary: Summary) -> list[Table]:
+def reach_tables(summary: Summary) -> list[Table]:
+    """Iterations, and seconds, to every tolerance."""
     targets = [target for target in summary.targets if target.kind != "converged"]
     header = ("solver", *(target.label for target in targets))
     iterations, seconds = [], []
@@ -114,26 +83,8 @@ def _reach_tables(summary: Summary) -> list[Table]:
     ]
 
 
-def _against(summary: Summary, yardstick: str) -> Table:
-    rows = []
-    for s in summary.solvers:
-        if yardstick in s.against:
-            rows.append((s.solver, *(_ratio_text(s.against[yardstick][target.key]) for target in summary.targets)))
-    note = (
-        f"Iterations / time relative to {yardstick} (below 1 is better), geometric means over the problems on which "
-        "both reached the target. In brackets their number, then + the number of those that only this solver and - of "
-        f"those that only {yardstick} reached."
-    )
-    return Table(f"Against {yardstick}", ("solver", *(target.label for target in summary.targets)), rows, note)
-
-
-def _ratio_text(item: Comparison) -> str:
-    ours = f" +{item.only_solver}" if item.only_solver else ""
-    theirs = f" -{item.only_yardstick}" if item.only_yardstick else ""
-    return f"{number(item.iterations)} / {number(item.seconds)} ({item.both}{ours}{theirs})"
-
-
-def _details(summary: Summary) -> Table:
+def details(summary: Summary) -> Table:
+    """A row for each pair of problem and solver."""
     header = ("problem", "solver", "its to f*(1+0.001)", "converged", "rejected", "final cost", "final / best")
     rows = []
     for c in summary.cells:
@@ -144,17 +95,6 @@ def _details(summary: Summary) -> Table:
         rows.append((c.problem, c.solver, *counts, *ends, *times, c.termination))
     note = "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that of the whole solve."
     return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
-
-
-def problem_table(summary: Summary) -> Table:
-    """Sizes and costs of the problems."""
-    header = ("problem", "family", "cameras", "points", "observations", "initial cost", "best cost f*", "reached by")
-    rows = []
-    for p in summary.problems:
-        sizes = (str(p.cameras), str(p.points), str(p.observations))
-        rows.append((p.problem, p.family, *sizes, f"{p.initial_cost:.7g}", f"{p.best_cost:.7g}", p.best_solver))
-    note = "Costs are half the sum of squared residuals, pixels²."
-    return Table("Problems and their sizes", header, rows, note, text_columns=2)
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -173,7 +113,7 @@ def to_rich(table: Table) -> RichTable:
     from rich.text import Text
 
     drawn = RichTable(
-        title=Text(table.title) if table.title else None,
+        title=Text(table.title),
         caption=Text(table.note),
         title_justify="left",
         caption_justify="left",
@@ -185,14 +125,3 @@ def to_rich(table: Table) -> RichTable:
     for row in table.rows:
         drawn.add_row(*(Text(cell) for cell in row))
     return drawn
-
-
-def as_text(found: Sequence[Table]) -> str:
-    """Tables one below the other, their lines as long as they need to be."""
-    from rich.console import Console
-
-    with io.StringIO() as stream:
-        console = Console(file=stream, width=200, markup=False, emoji=False)
-        for table in found:
-            console.print(to_rich(table))
-        return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"

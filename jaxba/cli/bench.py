@@ -45,7 +45,8 @@ class Arguments:
     which wildcards and $VARIABLES are expanded), solvers, tolerance, repeats, max_iterations."""
 
     solvers: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_SOLVERS})")] = None
-    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], or, with the extra `ceres`,
+    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], where a policy may be a class of
+    your own, mine.py:Tenfold; or, with the extra `ceres`,
     pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default: Ceres'
     rule without and with embedded iterations, the default policy, and the paper's rule."""
 
@@ -93,9 +94,10 @@ def _bench(args: Arguments, command: str) -> int:
     if not solvers:
         raise common.UsageError("--solvers names no solver")
     from jaxba.bench import run
-    from jaxba.bench.sources import default_sources, sources
+    from jaxba.bench.sources import SCENE_PREFIX, sources
+    from jaxba.scenes import DEFAULT_SCENES
 
-    problems = sources(list(args.problems)) if args.problems else default_sources()
+    problems = sources([*args.problems] or [f"{SCENE_PREFIX}{name}" for name in DEFAULT_SCENES])
     jobs = run.plan(problems, solvers, repeats)
     settings = run.RunSettings(max_iterations, args.linear_solver, pad=not args.problems)
     try:
@@ -110,15 +112,15 @@ def _open(args: Arguments, jobs: Any, settings: Any, command: str) -> tuple[Path
     from jaxba.bench import run
     from jaxba.problem.bundle_problem import ProblemError
 
+    folder = Path(args.out or DEFAULT_OUT)
     if args.out is not None:
-        _check_apart(Path(args.out), args, jobs)
-        return Path(args.out), run.open_folder(Path(args.out), settings, jobs, command)
-    for number in itertools.count(1):
-        folder = Path(f"{DEFAULT_OUT}-{number}" if number > 1 else DEFAULT_OUT)
-        if run.command_of(folder) in (None, command):
-            _check_apart(folder, args, jobs)
-            with contextlib.suppress(ProblemError):  # a file has changed since, or is damaged
-                return folder, run.open_folder(folder, settings, jobs, command)
+        _check_apart(folder, args, jobs)
+        return folder, run.open_folder(folder, settings, jobs, command)
+    for number in itertools.count(2):
+        _check_apart(folder, args, jobs)
+        with contextlib.suppress(ProblemError):  # of another command, or a file has changed since, or is damaged
+            return folder, run.open_folder(folder, settings, jobs, command, alone=True)
+        folder = Path(f"{DEFAULT_OUT}-{number}")
     raise AssertionError
 
 

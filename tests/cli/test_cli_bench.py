@@ -17,11 +17,11 @@ import jaxba
 from jaxba import write_bal
 from jaxba.bench import report
 from jaxba.bench import run as bench_run
-from jaxba.bench.sources import default_sources
 from jaxba.cli.bench import run
 from jaxba.damping.learned import without_weights
 from jaxba.damping.registry import SHIPPED
 from jaxba.problem import geometry
+from jaxba.scenes import DEFAULT_SCENES
 from jaxba.structure.padding import capacity_of
 
 KEYS = [
@@ -227,7 +227,7 @@ def test_another_command_gets_a_folder_of_its_own_and_the_same_one_goes_on(tmp_p
 
 
 def test_the_default_scenes_share_programs():
-    capacities = {capacity_of(source.read()) for source in default_sources()}
+    capacities = {capacity_of(jaxba.random_scene(scene, 0)) for scene in DEFAULT_SCENES.values()}
     assert len(capacities) == 1
     assert None not in capacities
 
@@ -344,6 +344,73 @@ def test_the_final_costs_of_float32_are_computed_in_float64(tmp_path, undrawn, c
     assert rough["final_cost"] == pytest.approx(rough["trace"][-1]["cost"], rel=1e-4)
 
 
+RULES = """
+import dataclasses
+import jax.numpy as jnp
+import jaxba
+
+@jaxba.register_pytree
+@dataclasses.dataclass(frozen=True)
+class Same:
+    min_gain: float = 0.0
+
+    def init(self, info):
+        return (), jnp.asarray(1e-4, info.cost.dtype)
+
+    def propose(self, state, step):
+        return state, step.damping
+
+@jaxba.register_pytree
+@dataclasses.dataclass(frozen=True)
+class Branching(Same):
+    def propose(self, state, step):
+        return state, step.damping if step.accepted else 2 * step.damping
+
+@dataclasses.dataclass(frozen=True)
+class Unregistered(Same):
+    pass
+
+class Needy(Same):
+    def __init__(self, wish):
+        pass
+"""
+
+
+def test_a_rule_in_a_file_is_run_like_others_and_its_fault_is_one_line(tmp_path, undrawn, capsys):
+    path = tmp_path / "my+rules@1.py"
+    path.write_text(RULES)
+    names = [f"{path}:Same", f"{path}:Same+refine1", "constant:1e-4", f"{path}:Branching"]
+    status = bench(tmp_path / "run", "scene:tiny", "--solvers", ",".join(names), *BRIEF[2:])
+    check_one_line(status, capsys.readouterr().err, f"{path}, line 21: TracerBoolConversionError: ")
+    own, refined, constant = lines(tmp_path / "run")
+    assert [own["solver"], refined["solver"]] == names[:2]
+    assert own["final_cost"] == pytest.approx(constant["final_cost"], rel=1e-9)
+    assert refined["trace"][1]["cost"] < own["trace"][1]["cost"]
+    path.write_text(RULES + "# changed\n")
+    check_one_line(
+        bench(tmp_path / "run", "scene:tiny", "--solvers", names[0], *BRIEF[2:]), capsys.readouterr().err, "another"
+    )
+
+
+BAD_RULES = {
+    "None": "rules.py has no class None",
+    "Unregistered": "rules.py: ValueError: policy Unregistered is no pytree: decorate",
+    "Needy": "missing 1 required positional argument: 'wish'",
+    "jnp": "rules.py: TypeError: 'module' object is not callable",
+}
+
+
+@pytest.mark.parametrize("name", BAD_RULES)
+def test_a_class_that_is_no_rule_is_one_line_and_status_2(name, tmp_path, capsys):
+    path = tmp_path / "rules.py"
+    path.write_text(RULES)
+    check_one_line(bench(tmp_path / "run", "--solvers", f"{path}:{name}"), capsys.readouterr().err, BAD_RULES[name])
+    path.write_text("1 +")
+    check_one_line(
+        bench(tmp_path / "run", "--solvers", f"{path}:{name}"), capsys.readouterr().err, "rules.py: SyntaxError"
+    )
+
+
 def suite(tmp_path: Path, **entries) -> str:
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump(entries))
@@ -369,6 +436,7 @@ BAD = {
     "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
     "mixed types of a method": (["scene:tiny", "--solvers", "ceres,stba+ceres@mixed"], "mixed types are for plain LM"),
+    "missing rule": (["scene:tiny", "--solvers", "no.py:Rule"], "no.py: No such file"),
     "missing policy": (["scene:tiny", "--solvers", "no.safetensors"], "no.safetensors: No such file"),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),
