@@ -24,6 +24,7 @@ from jaxba.damping import (
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.learned import LearnedPolicy
 from jaxba.damping.policy import trained_step
+from jaxba.datasets import example_problem
 from jaxba.io import (
     read_bal,
     read_bundler,
@@ -139,6 +140,7 @@ __all__ = [
     "covariance",
     "differentiable_solve",
     "drop_invalid",
+    "example_problem",
     "hold",
     "initial_state",
     "inputs_of",

@@ -38,14 +38,15 @@ LOG_TIME_SPREAD = 20.0
 LABEL_DISTANCE = 0.06
 """Fraction of the axis height below which the labels of two dashed lines would overlap."""
 
+LABEL_WIDTH = 100
+"""Pixels of their labels, beside the chart."""
+
 _ROWS = (
-    "<b>%{fullData.name}</b><br>iteration %{customdata[0]}, %{customdata[1]:.3g} s<br>cost %{customdata[2]:.7g}<br>"
-    "λ %{customdata[3]:.3g}, gain %{customdata[4]:.3g}, %{customdata[5]}<extra></extra>"
+    "<b>%{fullData.name}</b> %{customdata[0]}: cost %{customdata[2]:.7g}, λ %{customdata[3]:.1e}%{customdata[4]}"
+    "<extra></extra>"
 )
-_STEPS = (
-    "<b>%{fullData.name}</b><br>%{y:.3g} % of the problems within %{x:.3g} times<br>the best solver's<extra></extra>"
-)
-_POINT = "<b>%{fullData.name}</b><br>%{x:.4g}: %{y:.4g}<extra></extra>"
+_STEPS = "<b>%{fullData.name}</b> %{y:.3g} % of the problems within %{x:.3g} times<extra></extra>"
+_POINT = "<b>%{fullData.name}</b> %{y:.4g} at %{x:.4g}<extra></extra>"
 
 Values: TypeAlias = Sequence[Any] | Mapping[str, Sequence[Any]]
 """Numbers of the points of a line, or by what is on x. NaN is a gap."""
@@ -139,13 +140,13 @@ def chart(
         "title": title,
         "note": note,
         "data": [{**one, "line": own} for one, own in zip(traces, thick, strict=True)],
-        "layout": {"height": height, "yaxis": y, "shapes": _dashed(dashed or {}, low, max(high, 10 * low))},
+        "layout": {"height": height, "yaxis": y, **_dashed(dashed or {}, low, max(high, 10 * low), y["type"] == "log")},
         "xaxes": dict(x),
     }
 
 
-def _dashed(lines: Mapping[str, float], low: float, high: float) -> list[dict[str, Any]]:
-    """Dashed lines over the width of a chart, labelled; those close to each other share a label."""
+def _dashed(lines: Mapping[str, float], low: float, high: float, log: bool) -> dict[str, Any]:
+    """Dashed lines over the width of a chart, with labels beside it; those close to each other share a label."""
     heights = {label: y for label, y in lines.items() if math.isfinite(y) and y > 0}
     labels: dict[float, list[str]] = {}
     for y, label in sorted((y, label) for label, y in heights.items()):
@@ -153,15 +154,14 @@ def _dashed(lines: Mapping[str, float], low: float, high: float) -> list[dict[st
             labels[next(reversed(labels))].append(label)
         else:
             labels[y] = [label]
-    name = lambda y: {"text": ", ".join(labels.get(y, ())), "textposition": "end", "yanchor": "bottom"}
-    return [
-        {
-            **{"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "layer": "below"},
-            "line": {"color": "#8a8f94", "dash": "4px,4px", "width": 1},
-            "label": {**name(y), "font": {"size": 11}},
-        }
+    stroke = {"color": "#8a8f94", "dash": "4px,4px", "width": 1}
+    shapes = [
+        {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "layer": "above", "line": stroke}
         for y in heights.values()
     ]
+    beside = {"xref": "paper", "x": 1, "xanchor": "left", "showarrow": False, "font": {"size": 11}}
+    notes = [{**beside, "y": math.log10(y) if log else y, "text": "<br>".join(text)} for y, text in labels.items()]
+    return {"shapes": shapes, "annotations": notes, "margin": {"r": LABEL_WIDTH}} if heights else {"shapes": []}
 
 
 def profile_chart(records: Sequence[Record], target: Target, styles: Mapping[str, Style]) -> Chart:
@@ -184,7 +184,7 @@ def profile_chart(records: Sequence[Record], target: Target, styles: Mapping[str
         traces.append(one)
     label = "\N{GREEK SMALL LETTER ALPHA} = {0} / least {0} of any solver"
     axes = {name: axis(label.format(name), log=True, limits=limits[name]) for name in AXES}
-    height = axis(f"% of all {count} problems", limits=(-3.0, 103.0))
+    height = axis(f"% of all {count} problems", limits=(0.0, 100.0))
     return chart(target.label, traces, axes, height, height=340)
 
 
@@ -216,10 +216,7 @@ def problem_charts(
     zero = min((value for value in dampings if value > 0), default=1e-2) / 100
     costs, distances, lambdas = [], [], []
     for solver, run in runs.items():
-        rows = [
-            [p.iteration, p.time_s, p.cost, p.damping, p.gain_ratio, "accepted" if p.accepted else "rejected"]
-            for p in run.trace
-        ]
+        rows = [[p.iteration, p.time_s, p.cost, p.damping, "" if p.accepted else ", rejected"] for p in run.trace]
         x = {name: [row[k] for row in rows] for k, name in enumerate(AXES)}
         known = [p.cost if math.isfinite(p.cost) else math.nan for p in run.trace]  # of NaN, `max` keeps the first
         own = lambda y, solver=solver, x=x, rows=rows: line(

@@ -1,4 +1,4 @@
-"""Writes the results of a benchmark: a summary, a page that needs no other file, and a picture of the profiles."""
+"""Writes the results of a benchmark: a summary, and a page that needs no other file."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 
 from jaxba.bench import page, profile
 from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
-from jaxba.bench.pictures import save_picture
 from jaxba.bench.summary import Summary, summarize, write_summary
-from jaxba.bench.tables import problem_table, tables
+from jaxba.bench.tables import compact, details, reach_tables
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
+
+FILES = ("summary.json", "report.html")
+"""What `write_all` writes."""
 
 
 def write_all(
@@ -24,9 +26,9 @@ def write_all(
     *,
     metadata: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Writes `summary.json`, `report.html` and `profile.png` into a folder and returns their paths.
+    """Writes `summary.json` and `report.html` into a folder and returns their paths.
 
-    Existing files are replaced. The picture has the performance profile at the tolerance, by iterations and by time.
+    Existing files are replaced.
 
     Args:
         records: at least one.
@@ -46,11 +48,9 @@ def write_all(
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize(records, tolerance, metadata or run_metadata(records))
-    files = [folder / "summary.json", folder / "report.html", folder / "profile.png"]
+    files = [folder / name for name in FILES]
     write_summary(files[0], summary)
     write_text(files[1], to_html(records, summary, tolerance))
-    styles = solver_styles(profile.solver_names(records))
-    save_picture(profile_chart(records, profile.Target("tau", tolerance), styles), files[2])
     return files
 
 
@@ -80,11 +80,14 @@ def to_html(records: Sequence[Record], summary: Summary, tolerance: float = 1e-3
     styles = solver_styles(profile.solver_names(records))
     facts = {str(name): str(value) for name, value in summary.metadata.items()}
     whole = page.Page("jaxba benchmark", facts, styles, AXES)
-    profiles = [profile_chart(records, target, styles) for target in profile.cost_targets(tolerance)]
-    whole.add("Performance profiles", page.note(PROFILES), whole.charts(profiles))
     names = profile.problem_names(records)
-    by_problem = {name: whole.charts(problem_charts(records, name, tolerance, styles)) for name in names}
-    whole.add("Convergence and damping", page.note(RUNS), page.groups("problem", by_problem))
-    for table in (*tables(summary), problem_table(summary)):
+    if len(names) > 1:  # of one problem they say nothing
+        profiles = [profile_chart(records, target, styles) for target in profile.cost_targets(tolerance)]
+        whole.add("Performance profiles", page.note(PROFILES), whole.charts(profiles))
+    label = "{0.problem}: {0.cameras} cameras, {0.points} points, {0.observations} observations"
+    labels = [label.format(one) for one in summary.problems]
+    drawn = [whole.charts(problem_charts(records, name, tolerance, styles)) for name in names]
+    whole.add("Convergence and damping", page.note(RUNS), page.groups("problem", dict(zip(labels, drawn, strict=True))))
+    for table in (compact(summary), *reach_tables(summary), details(summary)):
         whole.add_table(table)
     return whole.to_html(summary.warnings)

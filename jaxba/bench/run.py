@@ -15,7 +15,7 @@ import jax
 import jaxba
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.damping import DampingPolicy
-from jaxba.damping.registry import SUFFIX
+from jaxba.damping.registry import fault, file_of
 from jaxba.io import json_lines
 from jaxba.io.files import visible
 from jaxba.lm.termination import Tolerances
@@ -50,6 +50,9 @@ class RunSettings:
     linear_solver: str = "auto"
     """`auto`, `explicit`, `sparse` or `implicit`. Applies to the method `lm`; others have their own solver."""
 
+    pad: bool = False
+    """Whether problems are padded, so that those of one capacity share compiled programs."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -73,7 +76,7 @@ def run_solver(
     else:
         policy, options = solver.build()
         linear_solver = settings.linear_solver if solver.method == DEFAULT_METHOD else "auto"
-        options = replace(options, linear_solver=linear_solver, compilation="full", **limits)
+        options = replace(options, linear_solver=linear_solver, pad=settings.pad, compilation="full", **limits)
         solution, backend = solve(problem, policy, options, callback=watch), ""
     record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
     if solver.peer:
@@ -134,20 +137,24 @@ def _check_options(solver: SolverName) -> None:
         raise InputError(f"{error} (in {str(solver)!r})") from None
 
 
-def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
-    """Creates the folder, or continues a benchmark in it. Writes the settings. Returns the records that the folder
-    already has, one for each run. Raises ProblemError: the folder has runs with other settings, or results of other
-    problems or policies under the same names. Files are compared by checksum."""
+def open_folder(
+    folder: Path, settings: RunSettings, jobs: Sequence[Job], command: str = "", alone: bool = False
+) -> list[Record]:
+    """Creates the folder, or continues a benchmark in it. Writes the settings and the command. Returns the records that
+    the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, of another
+    command if that must be `alone`, or results of other problems or policies under the same names. Files are compared
+    by checksum."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
     paths = {s.name: s.location for s in sources if not s.location.startswith(SCENE_PREFIX)}
-    paths |= {job.solver.policy: job.solver.policy for job in jobs if job.solver.policy.endswith(SUFFIX)}
+    paths |= {job.solver.policy: file for job in jobs if (file := file_of(job.solver.policy))}
     files = {name: digest for name, file in paths.items() if (digest := _digest(Path(file)))}
-    current: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}, "files": files}
+    names = {source.name: source.location for source in sources}
+    current: dict[str, Any] = {"command": command, **asdict(settings), "problems": names, "files": files}
     done = _results(folder / RESULTS)
     solved = {record.problem for record in done}
-    used = lambda name: name in solved or (name.endswith(SUFFIX) and any(name in record.solver for record in done))
+    used = lambda name: name in solved or (file_of(name) and any(name in record.solver for record in done))
     if path.exists():
         try:
             previous = json.loads(path.read_text())
@@ -155,7 +162,8 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
             known_files = dict(previous.pop("files", {}))  # absent in folders of older versions
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
-        changed = [key for key, value in asdict(settings).items() if previous.get(key) != value]
+        changed = ["command"] if alone and previous.get("command") != command else []
+        changed += [key for key, value in asdict(settings).items() if previous.get(key, value) != value]
         changed += [name for name, file in current["problems"].items() if used(name) and known.get(name, file) != file]
         changed += [name for name, digest in files.items() if used(name) and known_files.get(name, digest) != digest]
         if changed:
@@ -222,9 +230,11 @@ def execute(
             on_error(ProblemError(f"{job.source.name}, {job.solver}: {error}"))
             continue
         except Exception as error:
-            if not out_of_memory(error):
+            own = file_of(job.solver.policy)
+            if not (memory := out_of_memory(error)) and not own:
                 raise
-            on_error(ProblemError(f"{job.source.name}, {job.solver}: not enough memory"))
+            reason = "not enough memory" if memory or not own else fault(error, own)
+            on_error(ProblemError(f"{job.source.name}, {job.solver}: {reason}"))
             continue
         json_lines.append(folder / RESULTS, record)
         yield record

@@ -50,11 +50,6 @@ class Source:
         return random_scene(DEFAULT_SCENES.get(name) or scene_like(name), seed)
 
 
-def default_sources() -> list[Source]:
-    """The sources of `DEFAULT_SCENES`."""
-    return sources([f"{SCENE_PREFIX}{name}" for name in DEFAULT_SCENES])
-
-
 def sources(locations: list[str]) -> list[Source]:
     """Checks that problems exist, and gives each a unique name. Locations are paths, random scenes (`scene:NAME:SEED`),
     or names of downloaded BAL problems such as ladybug-49, if there is no file of that name; duplicates count once.

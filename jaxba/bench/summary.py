@@ -19,15 +19,12 @@ import numpy as np
 
 from jaxba.bench import profile
 from jaxba.bench.profile import Target
-from jaxba.game.statistics import SHORTEST_TIME, Comparison, Reached, capped, compare, geometric_mean
+from jaxba.game.statistics import SHORTEST_TIME, Reached, capped, geometric_mean
 from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
-YARDSTICKS = ("classic", "ceres")
-"""Solvers that all others are compared with: the baseline of the paper, and the rule of the most used library."""
-
-FORMAT = 1
+FORMAT = 2
 """Version of `summary.json`; it changes when a key changes its meaning."""
 
 
@@ -44,9 +41,7 @@ class Cell(NamedTuple):
     iterations: float
     rejected: float
     seconds: float  # solve time without compilation
-    seconds_per_iteration: float  # median over the iterations of all repeats; NaN without iterations
-    setup_s: float
-    compile_s: float
+    compile_s: float  # of all repeats, of which the first compiles
     reach: dict[str, Reached]  # by `Target.key`
 
 
@@ -65,20 +60,14 @@ class TargetSummary(NamedTuple):
 
 
 class SolverSummary(NamedTuple):
-    """One solver over all problems; ratios of ends, and medians, over those that it was run on."""
+    """One solver over all problems; the ratio of ends is over those that it was run on."""
 
     solver: str
     run: int  # number of problems that it was run on
     total: int  # of the benchmark
     targets: dict[str, TargetSummary]  # by `Target.key`
-    against: dict[str, dict[str, Comparison]]  # by yardstick and `Target.key`; none is compared with itself
     final_ratio_worst: float
-    final_ratio_mean: float  # geometric
-    rejected_share: float  # rejected iterations / iterations, over all runs
-    linear_failure_share: float  # of rejected iterations without a gain ratio; NaN if the traces have none at all
-    seconds_per_iteration: float
-    setup_s: float
-    compile_s: float
+    compile_s: float  # of all runs
 
 
 class ProblemSummary(NamedTuple):
@@ -125,7 +114,7 @@ def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapp
     return Summary(
         targets=targets,
         problems=[_problem(runs, starts[name], bests[name]) for name, runs in profile.by_problem(records).items()],
-        solvers=[_solver(solver, records, cells, found, len(names)) for solver in solvers],
+        solvers=[_solver(solver, cells, found, len(names)) for solver in solvers],
         cells=cells,
         warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
         metadata=dict(metadata or {}),
@@ -139,7 +128,6 @@ def _median(values: Iterable[float]) -> float:
 
 def _cell(runs: Sequence[Record], reaches: dict[str, Reached], f0: float, f_star: float) -> Cell:
     final = statistics.median(r.final_cost if math.isfinite(r.final_cost) else math.inf for r in runs)
-    steps = [b.time_s - a.time_s for r in runs for a, b in zip(r.trace, r.trace[1:], strict=False)]
     floor = profile.ZERO_RESIDUAL_FLOOR * f0
     return Cell(
         problem=runs[0].problem,
@@ -152,9 +140,7 @@ def _cell(runs: Sequence[Record], reaches: dict[str, Reached], f0: float, f_star
         iterations=_median(float(r.iterations) for r in runs),
         rejected=_median(float(r.iterations - r.accepted) for r in runs),
         seconds=_median(r.trace[-1].time_s if r.trace else r.total_s for r in runs),
-        seconds_per_iteration=_median(steps),
-        setup_s=_median(r.setup_s for r in runs),
-        compile_s=_median(r.compile_s for r in runs),
+        compile_s=sum(r.compile_s for r in runs),
         reach=reaches,
     )
 
@@ -167,32 +153,16 @@ def _problem(runs: Sequence[Record], f0: float, f_star: float) -> ProblemSummary
 
 
 def _solver(
-    solver: str,
-    records: Sequence[Record],
-    cells: Sequence[Cell],
-    found: Mapping[str, Mapping[str, Reached]],
-    total: int,
+    solver: str, cells: Sequence[Cell], found: Mapping[str, Mapping[str, Reached]], total: int
 ) -> SolverSummary:
     own = [cell for cell in cells if cell.solver == solver]
-    runs = [r for r in records if r.solver == solver]
-    yardsticks = [y for y in YARDSTICKS if y != solver and any(cell.solver == y for cell in cells)]
-    iterations = sum(r.iterations for r in runs)
-    points = [point for r in runs for point in r.trace[1:]]
-    failures = sum(not p.accepted and not math.isfinite(p.gain_ratio) for p in points)
-    knows_gain = any(math.isfinite(p.gain_ratio) for p in points)
     return SolverSummary(
         solver=solver,
         run=len(own),
         total=total,
         targets={key: _target(rows[solver]) for key, rows in found.items()},
-        against={y: {key: compare(rows[solver], rows[y]) for key, rows in found.items()} for y in yardsticks},
         final_ratio_worst=max(cell.final_ratio for cell in own),
-        final_ratio_mean=geometric_mean(cell.final_ratio for cell in own),
-        rejected_share=(iterations - sum(r.accepted for r in runs)) / iterations if iterations else math.nan,
-        linear_failure_share=failures / len(points) if knows_gain else math.nan,
-        seconds_per_iteration=_median(cell.seconds_per_iteration for cell in own),
-        setup_s=_median(cell.setup_s for cell in own),
-        compile_s=_median(cell.compile_s for cell in own),
+        compile_s=sum(cell.compile_s for cell in own),
     )
 
 
@@ -224,7 +194,7 @@ def to_json(summary: Summary) -> dict[str, Any]:
     rules = {
         "iteration_limit": profile.ITERATION_LIMIT,
         "zero_residual_floor": profile.ZERO_RESIDUAL_FLOOR,
-        "means": "geometric, over reached problems; iterations_capped over all problems; ratios solver / yardstick",
+        "means": "geometric, over reached problems; iterations_capped over all problems",
     }
     body = json_lines.plain(replace(summary, metadata=metadata))
     return {"format": FORMAT, "rules": rules, **body, "targets": targets}

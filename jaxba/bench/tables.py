@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jaxba.bench import profile
-from jaxba.bench.summary import YARDSTICKS, Summary
-from jaxba.game.statistics import Comparison
+from jaxba.bench.summary import Summary
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,36 +41,26 @@ def percentage(fraction: float) -> str:
     return "-" if math.isnan(fraction) else f"{100 * fraction:.0f} %"
 
 
-def tables(summary: Summary, details: bool = True) -> list[Table]:
-    """All tables of a summary; with `details` also the one with a row for each pair of problem and solver."""
-    found = [_overview(summary), *_reach_tables(summary)]
-    found += [
-        _against(summary, yardstick) for yardstick in YARDSTICKS if any(yardstick in s.against for s in summary.solvers)
-    ]
-    return [*found, _details(summary)] if details else found
-
-
-def _overview(summary: Summary) -> Table:
-    header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
+def compact(summary: Summary) -> Table:
+    """What is worth knowing of every solver, in 100 columns."""
+    header = ("solver", "iterations\nto 0.1 %", "seconds\nto 0.1 %", "reached", "iterations\nto the end")
     rows = []
     for s in summary.solvers:
-        end = s.targets["converged"]
-        means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
-        fractions = (percentage(s.rejected_share), percentage(s.linear_failure_share))
-        ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
-        rows.append(
-            (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *fractions, number(s.compile_s))
-        )
+        near, end = s.targets["relative_0.001"], s.targets["converged"]
+        counts = [f"{one.reached}/{one.total}" for one in (near, end)]
+        means = [number(x) for x in (near.iterations_capped, near.seconds, end.iterations_capped)]
+        ends = counts[1], number(s.final_ratio_worst, 5), f"{s.compile_s:.1f}"
+        rows.append((s.solver, *means[:2], counts[0], means[2], *ends))
     note = (
-        f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
-        "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
-        f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): fractions of all iterations. "
-        f"Seconds per iteration and compilation: medians over problems."
+        "0.1 %: above the best cost that any solver reached. Geometric means over problems; a failure counts as "
+        f"{profile.ITERATION_LIMIT} iterations, and not in the seconds. A program that several solvers or problems "
+        "share is compiled for the first one."
     )
-    return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
+    return Table("Solvers", (*header, "converged", "worst end\n/ best", "seconds of\ncompiling"), rows, note)
 
 
-def _reach_tables(summary: Summary) -> list[Table]:
+def reach_tables(summary: Summary) -> list[Table]:
+    """Iterations, and seconds, to every tolerance."""
     targets = [target for target in summary.targets if target.kind != "converged"]
     header = ("solver", *(target.label for target in targets))
     iterations, seconds = [], []
@@ -94,26 +83,8 @@ def _reach_tables(summary: Summary) -> list[Table]:
     ]
 
 
-def _against(summary: Summary, yardstick: str) -> Table:
-    rows = []
-    for s in summary.solvers:
-        if yardstick in s.against:
-            rows.append((s.solver, *(_ratio_text(s.against[yardstick][target.key]) for target in summary.targets)))
-    note = (
-        f"Iterations / time relative to {yardstick} (below 1 is better), geometric means over the problems on which "
-        "both reached the target. In brackets their number, then + the number of those that only this solver and - of "
-        f"those that only {yardstick} reached."
-    )
-    return Table(f"Against {yardstick}", ("solver", *(target.label for target in summary.targets)), rows, note)
-
-
-def _ratio_text(item: Comparison) -> str:
-    ours = f" +{item.only_solver}" if item.only_solver else ""
-    theirs = f" -{item.only_yardstick}" if item.only_yardstick else ""
-    return f"{number(item.iterations)} / {number(item.seconds)} ({item.both}{ours}{theirs})"
-
-
-def _details(summary: Summary) -> Table:
+def details(summary: Summary) -> Table:
+    """A row for each pair of problem and solver."""
     header = ("problem", "solver", "its to f*(1+0.001)", "converged", "rejected", "final cost", "final / best")
     rows = []
     for c in summary.cells:
@@ -126,33 +97,29 @@ def _details(summary: Summary) -> Table:
     return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
 
 
-def problem_table(summary: Summary) -> Table:
-    """Sizes and costs of the problems."""
-    header = ("problem", "family", "cameras", "points", "observations", "initial cost", "best cost f*", "reached by")
-    rows = []
-    for p in summary.problems:
-        sizes = (str(p.cameras), str(p.points), str(p.observations))
-        rows.append((p.problem, p.family, *sizes, f"{p.initial_cost:.7g}", f"{p.best_cost:.7g}", p.best_solver))
-    note = "Costs are half the sum of squared residuals, pixels²."
-    return Table("Problems and their sizes", header, rows, note, text_columns=2)
-
-
-def print_summary(summary: Summary, console: Console, details: bool = True) -> None:
-    """Prints all tables to a rich console, warnings first."""
+def print_summary(summary: Summary, console: Console) -> None:
+    """Prints the compact table to a rich console, warnings first."""
     from rich.text import Text
 
     for warning in summary.warnings:
         console.print(Text(f"warning: {warning}", style="yellow"))
-    for table in tables(summary, details):
-        console.print(to_rich(table))
+    console.print(to_rich(compact(summary)))
 
 
 def to_rich(table: Table) -> RichTable:
     """The table for a rich console."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    drawn = RichTable(title=Text(table.title), caption=Text(table.note), title_justify="left", caption_justify="left")
+    drawn = RichTable(
+        title=Text(table.title),
+        caption=Text(table.note),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
     for i, name in enumerate(table.header):
         drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
     for row in table.rows:

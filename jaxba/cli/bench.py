@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import glob
+import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -17,15 +19,14 @@ from jaxba.cli import common
 from jaxba.cli.options import options
 from jaxba.problem.options import LinearSolverChoice
 
-DEFAULT_SOLVERS = "guarded,bold,classic,ceres,ceres+refine3,ceres+embedded"
-"""The default policy and the guard of agents, the paper's rule, and Ceres' rule with and without embedded
-iterations."""
+DEFAULT_SOLVERS = "ceres,ceres+refine3,guarded,classic"
+"""Ceres' rule, without and with embedded point iterations, the default policy, and the paper's rule."""
 
-FILE_WIDTH = 180
-"""Width of the tables in characters if the output is not a terminal."""
+DEFAULT_OUT = "runs/bench"
+"""Folder of the first benchmark whose folder is not given; that of the next is called `runs/bench-2`."""
 
-DETAILS_WIDTH = 120
-"""On a narrower terminal the table of every problem is left out; the report has it."""
+WIDTH = 100
+"""Width of the table in characters."""
 
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)
 """A variable that `os.path.expandvars` expands."""
@@ -37,16 +38,17 @@ class Arguments:
 
     problems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Files, downloaded BAL problems such as ladybug-49 (see jaxba-data), or random scenes such as scene:ladybug-49 or
-    scene:tiny:7. Default: the problems of the suite, or eight random scenes."""
+    scene:tiny:7. Default: the problems of the suite, or six random scenes, padded to one shape."""
 
     suite: str | None = None
     """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems (names or paths, in
     which wildcards and $VARIABLES are expanded), solvers, tolerance, repeats, max_iterations."""
 
     solvers: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_SOLVERS})")] = None
-    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], or, with the extra `ceres`,
-    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default: the
-    default policy, the other two that ship, the paper's rule, and Ceres' rule with and without embedded iterations."""
+    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], where a policy may be a class of
+    your own, mine.py:Tenfold; or, with the extra `ceres`,
+    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default: Ceres'
+    rule without and with embedded iterations, the default policy, and the paper's rule."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""
@@ -63,8 +65,9 @@ class Arguments:
     strict: bool = False
     """Fail instead of skipping invalid parts of the input."""
 
-    out: str = "runs/bench"
-    """Folder of the results. A second run with the same folder does only what is missing."""
+    out: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_OUT})")] = None
+    """Folder of the results. A second run with the same folder does only what is missing. Default: the first of
+    runs/bench, runs/bench-2, ... that holds nothing, or this command's results."""
 
 
 def main() -> None:
@@ -91,49 +94,69 @@ def _bench(args: Arguments, command: str) -> int:
     if not solvers:
         raise common.UsageError("--solvers names no solver")
     from jaxba.bench import run
-    from jaxba.bench.sources import default_sources, sources
+    from jaxba.bench.sources import SCENE_PREFIX, sources
+    from jaxba.scenes import DEFAULT_SCENES
 
-    problems = sources(list(args.problems)) if args.problems else default_sources()
+    problems = sources([*args.problems] or [f"{SCENE_PREFIX}{name}" for name in DEFAULT_SCENES])
     jobs = run.plan(problems, solvers, repeats)
-    _check_apart(args, jobs)
-    settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
+    settings = run.RunSettings(max_iterations, args.linear_solver, pad=not args.problems)
     try:
-        return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict, command)
+        folder, done = _open(args, jobs, settings, command)
+        return _run_missing(folder, done, jobs, settings, tolerance, args.strict, command)
     except OSError as error:
-        raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
+        raise common.UsageError(f"--out {args.out or DEFAULT_OUT}: {error.strerror or error}") from None
 
 
-def _check_apart(args: Arguments, jobs: Any) -> None:
-    """Refuses results in the place of a file that is read."""
+def _open(args: Arguments, jobs: Any, settings: Any, command: str) -> tuple[Path, Any]:
+    """The folder of the results, and the records in it."""
     from jaxba.bench import run
+    from jaxba.problem.bundle_problem import ProblemError
+
+    folder = Path(args.out or DEFAULT_OUT)
+    if args.out is not None:
+        _check_apart(folder, args, jobs)
+        return folder, run.open_folder(folder, settings, jobs, command)
+    for number in itertools.count(2):
+        _check_apart(folder, args, jobs)
+        with contextlib.suppress(ProblemError):  # of another command, or a file has changed since, or is damaged
+            return folder, run.open_folder(folder, settings, jobs, command, alone=True)
+        folder = Path(f"{DEFAULT_OUT}-{number}")
+    raise AssertionError
+
+
+def _check_apart(folder: Path, args: Arguments, jobs: Any) -> None:
+    """Refuses results in the place of a file that is read."""
+    from jaxba.bench import report, run
     from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
 
-    names = (run.SETTINGS, run.RESULTS, "summary.json", "report.html", "profile.png")
+    names = (run.SETTINGS, run.RESULTS, *report.FILES)
     problems = [one for job in jobs for one in problem_files(job.source.location)]
     policies = [policy_file(job.solver.policy) for job in jobs]
     read = {PROBLEM: problems, "a policy": policies, "the file of --suite": [args.suite]}
-    check_apart({"--out": [Path(args.out, name) for name in names]}, read)
+    check_apart({"--out": [folder / name for name in names]}, read)
 
 
-def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str) -> int:
+def _run_missing(
+    folder: Path, done: Any, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str
+) -> int:
     """Runs the jobs that the folder has no record of, and writes the report. Raises OSError if a file cannot be
     written."""
     from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from jaxba.bench import report, run
     from jaxba.bench.summary import summarize
     from jaxba.bench.tables import print_summary
     from jaxba.solver.record import Record
 
-    done = run.open_folder(folder, settings, jobs)
     common.prepare_process()
-    console = Console(markup=False, emoji=False)  # prints names without interpreting brackets and colons
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH, markup=False, emoji=False)
+    # prints names without interpreting brackets and colons
+    console = Console(markup=False, emoji=False, highlight=False)
+    console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
-        console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", highlight=False)
+        console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", soft_wrap=True)
     status = 0
 
     def fail(error: Exception) -> None:
@@ -141,26 +164,36 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, stric
         status = common.BAD_INPUT
         common.print_error(str(error))
 
+    say = functools.partial(console.print, soft_wrap=True)
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     try:
-        with common.notes_printed(lambda note: console.print(note, highlight=False, soft_wrap=True)):
-            for record in run.execute(jobs, done, folder, settings, fail, strict=strict):
-                records.append(record)
-                iterations = common.counted(record.iterations, "iteration")
-                console.print(
-                    f"{record.problem} {record.solver} #{record.repeat + 1}: {iterations}, "
-                    f"cost {record.final_cost:.8g}, {record.total_s:.2f} s, {record.termination}",
-                    highlight=False,
-                    soft_wrap=True,
-                )
+        with common.notes_printed(say), bar:
+            task = bar.add_task("reading and compiling", total=len(jobs), completed=len(records))
+            runs = run.execute(jobs, done, folder, settings, fail, strict=strict)
+            for problem, group in itertools.groupby(runs, lambda record: record.problem):
+                first = len(records)
+                for record in group:
+                    records.append(record)
+                    bar.update(task, advance=1, description=f"{problem} {record.solver}")
+                say(_line(problem, records[first:]))
     except KeyboardInterrupt:
-        console.print("interrupted; what is done is kept, run the same command again to continue", highlight=False)
+        say("interrupted; what is done is kept, run the same command again to continue")
         status = common.INTERRUPTED
     if records:
         metadata = {"command": command, **report.run_metadata(records), **run.machine()}
-        files = report.write_all(records, folder, tolerance, metadata=metadata)
-        print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
-        console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False, soft_wrap=True)
+        report.write_all(records, folder, tolerance, metadata=metadata)
+        print_summary(summarize(records, tolerance), console)
+        say(f"every problem and run: {folder / 'report.html'}")
     return status
+
+
+def _line(problem: str, records: Any) -> str:
+    """What was done on a problem."""
+    seconds = sum(one.setup_s + one.compile_s + one.total_s for one in records)
+    compiled, cost = sum(one.compile_s for one in records), min(one.final_cost for one in records)
+    runs = common.counted(len(records), "run")
+    return f"{problem}: {runs} in {seconds:.1f} s ({compiled:.1f} s of compilation), least cost {cost:.8g}"
 
 
 @dataclass(frozen=True)

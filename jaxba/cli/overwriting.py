@@ -42,11 +42,10 @@ def problem_files(path: str | None) -> list[StrPath]:
 
 def policy_file(policy: str) -> str | None:
     """The file of a policy's name, perhaps with its refinement; None if it names none."""
-    from jaxba.damping.registry import SUFFIX
+    from jaxba.damping.registry import file_of
     from jaxba.solver.names import split_refinement
 
-    name = split_refinement(policy)[0]
-    return name if name.endswith(SUFFIX) else None
+    return file_of(split_refinement(policy)[0])
 
 
 def _identity(path: StrPath) -> Hashable:

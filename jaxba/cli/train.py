@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -112,11 +113,14 @@ def _run(args: Arguments, command: str) -> int:
     config = _prepare(args, folder, name)
     common.prepare_process()
     console = common.console(FILE_WIDTH, markup=False)
-    with process.single_blas_thread(), Interrupt("chunk", graceful=False) as interrupt:
+    with process.single_blas_thread(), Interrupt("chunk", graceful=False) as interrupt, _Stages(console) as stages:
         try:
             with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
-                work = task.build(config, folder, console.print)
+                loops: list[Any] = []
+                compiling = lambda game: loops.append(driver.begin_compiling(config, game))
+                work = task.build(config, folder, stages, on_game=compiling)
             best: list[int] = []  # chunks of the best policies
+            began: list[tuple[float, int]] = []  # when training began, and after which chunk
             interrupt.graceful = True
 
             def keep(policies: tuple[driver.Best, ...]) -> None:
@@ -125,12 +129,16 @@ def _run(args: Arguments, command: str) -> int:
 
             def show(rows: list[Any]) -> None:
                 agent = config.game.agent
-                decades = (agent.high - agent.low) / 2
-                for line in view.lines(rows, config.chunks, work.rules, rows[0]["chunk"] in best, decades):
+                decades, row = (agent.high - agent.low) / 2, rows[0]
+                if not began:
+                    began.append((time.perf_counter() - row["chunk_s"] - row.get("evaluate_s", 0.0), row["chunk"] - 1))
+                mean = (time.perf_counter() - began[0][0]) / (row["chunk"] - began[0][1])
+                left = mean * (config.chunks - row["chunk"])
+                for line in view.lines(rows, config.chunks, work.rules, row["chunk"] in best, decades, left):
                     console.print(line)
 
-            hooks = driver.Hooks(console.print, show, keep, lambda: interrupt.requested)
-            outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
+            hooks = driver.Hooks(stages, show, keep, lambda: interrupt.requested, console.print)
+            outcome = driver.train(config, work.game, work.evaluate, folder, hooks, *loops)
             interrupt.graceful = False
         except KeyboardInterrupt:
             console.print(f"interrupted; go on with {_again(folder)}")
@@ -142,7 +150,33 @@ def _run(args: Arguments, command: str) -> int:
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return interrupt.status
-        return _finish(folder, work, outcome.best, console, command)
+        return _finish(folder, work, outcome.best, console, command, stages)
+
+
+class _Stages:
+    """Prints every stage of the work with its seconds once it has ended; a terminal shows the one that goes on."""
+
+    def __init__(self, console: Any) -> None:
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._task, self._print = self._bar.add_task("starting"), console.print
+        self._text, self._begun = "starting", time.perf_counter()
+
+    def __enter__(self) -> _Stages:
+        self._bar.start()
+        return self
+
+    def __call__(self, text: str) -> None:
+        """Ends the stage before, and begins another one."""
+        now = time.perf_counter()
+        self._print(f"{self._text}: {now - self._begun:.1f} s")
+        self._text, self._begun = text, now
+        self._bar.reset(self._task, description=text)
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:
@@ -181,7 +215,9 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
     return list(files)
 
 
-def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, command: str) -> int:
+def _finish(
+    folder: Path, work: Any, best: Sequence[Any], console: Any, command: str, stages: Callable[[str], None]
+) -> int:
     """Writes the policies and the page, and prints the comparison with the rules."""
     from jaxba.bench import run as bench_run
     from jaxba.bench import training_page
@@ -193,10 +229,10 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, command:
 
     files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
     rules_of_game = work.config.game
-    console.print("comparing with the rules")
+    stages("comparing with the rules")
     compared = work.compare([one.actor for one in best])
     table = _table(compared, rules_of_game.tolerance, sum(len(bank.initial_cost) for bank in work.held_out))
-    console.print("playing some episodes")
+    stages("episodes and page")
     chosen = best_of(best)
     kind, bank = work.config.bank.classes[0], work.held_out[0]
     policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
@@ -204,6 +240,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, command:
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE
     write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts))
+    stages("end")
     drawn = to_rich(table)
     drawn.columns[0].no_wrap = drawn.columns[-1].no_wrap = True
     console.print(drawn)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -90,3 +91,31 @@ def trained_step(policy: DampingPolicy) -> StepOptions:
     """The step that a policy was made for: that of its method `step_options`, if it has one, else a plain step."""
     made_for = getattr(policy, "step_options", None)
     return StepOptions() if made_for is None else made_for(StepOptions())
+
+
+_PARTS = ("min_gain", "init", "propose")
+"""What every policy has (`DampingPolicy`)."""
+
+
+def check_policy(policy: object) -> None:
+    """Raises a ValueError that says what a policy lacks."""
+    missing = [name for name in _PARTS if not hasattr(policy, name)]
+    if isinstance(policy, type) or len(missing) == len(_PARTS):
+        raise ValueError(f"policy must be the name of a policy or a policy, not {policy!r}")
+    name = type(policy).__name__
+    if missing:
+        raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
+    structure = jax.tree.structure(policy)
+    if jax.tree_util.treedef_is_leaf(structure):
+        raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jaxba.register_pytree")
+    for other, seen in _structures.items():
+        if other is not type(policy) and seen == structure:  # see `register_pytree`
+            raise ValueError(
+                f"policy {name} cannot be told from policy {other.__name__} of this process, whose compiled program "
+                "might run in its place: decorate it with jaxba.register_pytree, not with JAX's register_dataclass"
+            )
+    _structures[type(policy)] = structure
+
+
+_structures: dict[type, Any] = {}
+"""The last structure of a policy of each class, for `check_policy`."""

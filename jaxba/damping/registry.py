@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 import math
+import os
+import re
+import sys
+import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from jaxba.damping.agent_config import embedded
 from jaxba.damping.default_policy import Guarded
 from jaxba.damping.learned import ConstantAction, boldest
-from jaxba.damping.policy import DampingPolicy
+from jaxba.damping.policy import DampingPolicy, check_policy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 from jaxba.typing import InputError
@@ -47,6 +54,9 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 SUFFIX = ".safetensors"
 """Ending by which a name is the path of a policy file."""
 
+OWN = r".+\.py:\w+"
+"""Pattern of the name of a class in a Python file."""
+
 CONSTANT = "constant"
 """Prefix of `constant:VALUE`."""
 
@@ -55,12 +65,14 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: `learned`; the path of a policy file; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one;
-            or `constant:LAMBDA`.
+        name: `learned`; the path of a policy file; `FILE.py:CLASS`, for which the file is run; a key of `POLICIES`,
+            with `:FIRST_LAMBDA` for rules that have one; or `constant:LAMBDA`.
 
     Raises:
         InputError: no such policy, a lambda that is not a positive number, or a path that is not of a policy file.
     """
+    if re.fullmatch(OWN, name):
+        return _own(*name.rsplit(":", 1))
     if is_learned(name):
         return load_policy(SHIPPED if name == LEARNED else name)
     base, colon, number = name.partition(":")
@@ -71,7 +83,7 @@ def make_policy(name: str) -> DampingPolicy:
             f"unknown damping policy {name!r}: its name has no '+'; the method and embedded iterations are options"
         )
     if base not in POLICIES:
-        known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])
+        known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}", "FILE.py:CLASS"])
         raise InputError(f"unknown damping policy {name!r}; known: {known}")
     policy = POLICIES[base][0]()
     if not colon:
@@ -86,8 +98,52 @@ def is_learned(name: str) -> bool:
     return name == LEARNED or name.endswith(SUFFIX)
 
 
+def file_of(name: str) -> str | None:
+    """The file of a policy's name; None if it names none."""
+    if re.fullmatch(OWN, name):
+        return name.rsplit(":", 1)[0]
+    return name if name.endswith(SUFFIX) else None
+
+
+def _own(path: str, name: str) -> DampingPolicy:
+    """A policy of the user, made without arguments."""
+    try:
+        module = _module(os.path.abspath(path), os.stat(path).st_mtime_ns)
+        policy = getattr(module, name)() if hasattr(module, name) else None
+        if policy is not None:
+            check_policy(policy)
+    except Exception as error:
+        raise InputError(fault(error, path)) from None
+    if policy is None:
+        raise InputError(f"{path} has no class {name}")
+    return policy
+
+
+@functools.cache
+def _module(path: str, _changed: int) -> Any:
+    """The module of a file; one for all calls, so that its classes are the same ones."""
+    spec = importlib.util.spec_from_file_location(path, path)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[path] = module = importlib.util.module_from_spec(spec)  # dataclasses look there
+    spec.loader.exec_module(module)
+    return module
+
+
+def fault(error: Exception, path: str) -> str:
+    """What went wrong in a file of Python, and where, in one line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    numbers = [frame.lineno for frame in frames if frame.filename == os.path.abspath(path)]
+    where = f"{path}, line {numbers[-1]}" if numbers else path
+    if isinstance(error, OSError) and not numbers:
+        return f"{where}: {error.strerror}"
+    return f"{where}: {type(error).__name__}: {str(error).partition(chr(10))[0]}"
+
+
 def brings_step(name: str) -> bool:
     """Whether a policy of this name brings a step of its own, with embedded iterations or without."""
+    if re.fullmatch(OWN, name):
+        return hasattr(make_policy(name), "step_options")
     return is_learned(name) or name.partition(":")[0] in (BOLD, GUARDED)
 
 

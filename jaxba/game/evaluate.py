@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxba.damping import ConstantAction, DampingPolicy
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, reach
@@ -83,13 +84,17 @@ def best_constant_action(
     options: StepOptions,
     tolerance: float,
     limit: int,
+    beside: Mapping[str, tuple[DampingPolicy, StepOptions]] | None = None,
 ) -> ConstantAction:
     """The constant action with the fewest mean iterations: what an agent must beat to have learned something.
 
-    The banks are those of training; `config` says what an action means, for the rest see `evaluate`.
+    The banks are those of training; `config` says what an action means, `beside` are policies that are played, too, so
+    that all share programs, for the rest see `evaluate`.
     """
-    tried = [ConstantAction((action,), config) for action in CONSTANT_ACTIONS]
-    return min(tried, key=lambda one: evaluate(kinds, banks, one, options, tolerance, limit).mean)
+    tried = {str(action): ConstantAction((action,), config) for action in CONSTANT_ACTIONS}
+    steps = alike({**(beside or {}), **{name: (one, options) for name, one in tried.items()}})
+    mean = lambda name: evaluate(kinds, banks, *steps[name], tolerance, limit).mean
+    return tried[min(tried, key=mean)]
 
 
 Runs = list[Trajectories]
@@ -102,10 +107,10 @@ def play_all(
     policies: Mapping[str, tuple[DampingPolicy, StepOptions]],
     limit: int = 40,
 ) -> dict[str, Runs]:
-    """Trajectories of every policy on every scene, by the policy's name."""
+    """Trajectories of every policy on every scene, by the policy's name. Those with equal steps share programs."""
     return {
         name: [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
-        for name, (policy, options) in policies.items()
+        for name, (policy, options) in alike(policies).items()
     }
 
 

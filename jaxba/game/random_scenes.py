@@ -101,7 +101,7 @@ class _Rig(NamedTuple):
 
 
 @for_traces
-@functools.partial(jit, static_argnames=("kind", "count", "dtype"))
+@functools.partial(jit, once=True, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
     """Random scenes, the unusable ones included; see `scene_bank.solve_scenes`. Not of the family `windows`.
 

@@ -19,6 +19,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import ProblemInfo, make_policy
+from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.rollout import play
 from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
@@ -89,7 +90,7 @@ def worth_solving(kind: SceneClass, info: ProblemInfo) -> Int[np.ndarray, " kept
     return np.flatnonzero((error < largest * info.focal) & (info.observations >= MIN_OBSERVATIONS))
 
 
-@functools.partial(jit, static_argnames=("kind",))
+@functools.partial(jit, once=True, static_argnames=("kind",))
 def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     """The cost of every start, pixels squared."""
     layout = class_layout(kind, StepOptions())
@@ -174,9 +175,9 @@ def solve_scenes(
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
-    for rule in rules:
+    for rule, (policy, step) in alike({rule: (make_policy(rule), options) for rule in rules}).items():
         on_rule(rule)
-        runs[rule] = play(kind, bank, make_policy(rule), options, PORTFOLIO_ITERATIONS, PORTFOLIO_FTOL)
+        runs[rule] = play(kind, bank, policy, step, PORTFOLIO_ITERATIONS, PORTFOLIO_FTOL)
     best = np.min([run.costs[:, -1] for run in runs.values()], axis=0)
     to_best = reach(runs[rules[0]].costs, best, tolerance)
     bank = bank._replace(best_cost=jnp.asarray(best), ceres_iterations=jnp.asarray(to_best))

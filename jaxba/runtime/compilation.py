@@ -27,7 +27,7 @@ from jax import monitoring
 
 from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
 from jaxba.runtime.fusion import fast_compilation
-from jaxba.runtime.jit import Options, jit, known_options, right_options
+from jaxba.runtime.jit import Options, jit, quick_options, right_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -37,9 +37,6 @@ for it, by the number of observations."""
 
 Level = Literal["full", "quick"]
 """How much one program is optimised."""
-
-QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""XLA's options of level quick, as far as a jaxlib knows them; from 0.12 on there are no older emitters."""
 
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
 """The option that switches XLA's newer kernel emitters off."""
@@ -64,10 +61,9 @@ def quick_iterations(kind: Kind, observations: int) -> int:
     return count if count >= TYPICAL[kind] else 0
 
 
-@functools.cache
 def compiler_options(level: Level) -> Options:
     """Options of a level that this jaxlib knows; none for `full`, and on a GPU."""
-    return known_options(QUICK) if level == "quick" and jax.default_backend() == "cpu" else {}
+    return quick_options() if level == "quick" else {}
 
 
 def uses_older_emitters(level: Level) -> bool:

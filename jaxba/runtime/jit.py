@@ -20,6 +20,17 @@ RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}
 """Options that every program on a CPU is compiled with, as far as a jaxlib knows them: no fusions for YNNPACK."""
 
 
+QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+"""XLA's options for programs that are hardly optimised, as far as a jaxlib knows them; from 0.12 on there are no older
+emitters."""
+
+
+@functools.cache
+def quick_options() -> Options:
+    """The options of `QUICK` that this jaxlib knows; none on a GPU."""
+    return known_options(QUICK) if jax.default_backend() == "cpu" else {}
+
+
 @functools.cache
 def right_options() -> Options:
     """The options of `RIGHT` that this jaxlib knows; none on a GPU."""
@@ -48,15 +59,16 @@ class jit:
     has the options of that.
     """
 
-    def __init__(self, function: Callable[..., Any], **settings: Any) -> None:
-        """`function` is what it computes, `settings` are those of `jax.jit`."""
+    def __init__(self, function: Callable[..., Any], *, once: bool = False, **settings: Any) -> None:
+        """`function` is what it computes, `settings` are those of `jax.jit`. What runs `once` is hardly optimised."""
         functools.update_wrapper(self, function)
         self._part = jax.jit(function, **settings)
-        self._settings = settings
+        self._settings, self._once = settings, once
 
     @functools.cached_property
     def _whole(self) -> Any:  # only now: JAX's backend must not start when a module is imported
-        return jax.jit(self.__wrapped__, compiler_options=right_options(), **self._settings)
+        options = right_options() | (quick_options() if self._once else {})
+        return jax.jit(self.__wrapped__, compiler_options=options, **self._settings)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         return (self._whole if trace_state_clean() else self._part)(*arguments, **named)

@@ -216,14 +216,15 @@ def _far(config: SceneConfig) -> SceneConfig:
     return replace(config, start_rotation=0.01, start_center=0.1, start_point=0.03, start_focal=0.03)
 
 
+_SMALL = SceneConfig(cameras=20, points=1500, mean_track=4.5)
+"""Scenes of this size have one capacity (structure/padding.py), and so share compiled programs."""
+
 DEFAULT_SCENES: dict[str, SceneConfig] = {
-    "street-40": SceneConfig(cameras=40, points=4000, mean_track=4.5),
-    "street-20-drift": SceneConfig(cameras=20, points=2500, mean_track=4.5, start_drift=0.003),
-    "street-24-outliers": SceneConfig(cameras=24, points=2500, mean_track=4.5, outlier_share=0.02),
-    "lateral-30": SceneConfig(cameras=30, points=3000, mean_track=4.5, trajectory="lateral"),
-    "photos-24": SceneConfig(cameras=24, points=3000, mean_track=4.0, trajectory="photos"),
-    "photos-14-far": _far(SceneConfig(cameras=14, points=2500, mean_track=4.0, trajectory="photos")),
-    "orbit-16-noisy": SceneConfig(cameras=16, points=1500, mean_track=5.0, trajectory="orbit", noise=2.0),
-    "orbit-12-far": _far(SceneConfig(cameras=12, points=1500, mean_track=5.0, trajectory="orbit")),
+    "street": replace(_SMALL, start_drift=0.003),
+    "street-outliers": replace(_SMALL, outlier_share=0.02),
+    "lateral": replace(_SMALL, trajectory="lateral"),
+    "photos-far": _far(replace(_SMALL, trajectory="photos")),
+    "orbit-noisy": replace(_SMALL, trajectory="orbit", noise=2.0),
+    "orbit-far": _far(replace(_SMALL, trajectory="orbit")),
 }
 """Random scenes that commands use if no problem is given: `jaxba-bench` all of them, `jaxba-solve` the first."""

@@ -13,7 +13,7 @@ from typing import Any, Literal, cast, get_args
 from jaxba.damping import DampingPolicy, brings_step, make_policy
 from jaxba.damping.agent_config import embedded
 from jaxba.damping.policy import trained_step
-from jaxba.damping.registry import SUFFIX
+from jaxba.damping.registry import OWN, SUFFIX
 from jaxba.problem.options import EMBEDDED, Refinement, StepOptions
 from jaxba.solver.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.solver.options import Dtype, SolveOptions
@@ -140,15 +140,16 @@ def parse_solver(name: str) -> SolverName:
     """
     if name.strip().partition(":")[0] in PEERS:
         return _parse_peer(name.strip())
-    # the path of a policy file may contain `+` and `@`: it ends with the suffix of such files
-    path, suffix, rest = name.strip().rpartition(SUFFIX)
+    # the path of a file may contain `+` and `@`
+    named = re.match(rf"(.*\{SUFFIX}|{OWN})(.*)", name.strip(), re.DOTALL)
+    path, rest = named.groups() if named else ("", name.strip())
     prefix, at, dtype = rest.partition("@")
     prefix, refine, stated = split_refinement(prefix)
     parts = prefix.split("+")
-    if suffix:
+    if path:
         method, plus, file = path.partition("+")
         known = bool(plus) and method.partition(":")[0] in METHODS
-        parts[0] = (file if known else path) + suffix + parts[0]
+        parts[0] = (file if known else path) + parts[0]
         parts = [method, *parts] if known else parts
     # a `+` in an exponent belongs to the number: constant:1e+2
     merged: list[str] = []

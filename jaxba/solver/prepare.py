@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy
+from jaxba.damping.policy import check_policy
 from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState
 from jaxba.lm.step import state_of
@@ -38,9 +39,6 @@ DEFAULT_POLICY = GUARDED
 PADDED_CAMERAS, PADDED_OBSERVATIONS = 64, 60_000
 """Largest problem that is padded by default. Measured: iterations take 1.1 to 1.4 times as long up to there, but twice
 with 2,000 observations; with 77 cameras 1.2 to 1.5 times."""
-
-POLICY_PARTS = ("min_gain", "init", "propose")
-"""What every damping policy has (`DampingPolicy`)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -149,7 +147,7 @@ def set_up(
     options = checked_options(options)
     if isinstance(policy, str):
         policy, options = resolve_policy(policy, options)
-    _check_policy(policy)
+    check_policy(policy)
     step = options.step_options(policy)
     away = set_aside(problem) if away is None else away
     devices = distributed.use_devices(options.devices)
@@ -185,27 +183,3 @@ def _pads(observations: ObservationOrder, options: SolveOptions) -> bool:
         return options.pad
     small = observations.num_cameras <= PADDED_CAMERAS and len(observations.order) <= PADDED_OBSERVATIONS
     return small and options.compilation != "full"
-
-
-def _check_policy(policy: object) -> None:
-    """Raises a ValueError that says what a policy lacks."""
-    missing = [name for name in POLICY_PARTS if not hasattr(policy, name)]
-    if isinstance(policy, type) or len(missing) == len(POLICY_PARTS):
-        raise ValueError(f"policy must be the name of a policy or a policy, not {policy!r}")
-    name = type(policy).__name__
-    if missing:
-        raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
-    structure = jax.tree.structure(policy)
-    if jax.tree_util.treedef_is_leaf(structure):
-        raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jaxba.register_pytree")
-    for other, seen in _structures.items():
-        if other is not type(policy) and seen == structure:  # see `register_pytree`
-            raise ValueError(
-                f"policy {name} cannot be told from policy {other.__name__} of this process, whose compiled program "
-                "might run in its place: decorate it with jaxba.register_pytree, not with JAX's register_dataclass"
-            )
-    _structures[type(policy)] = structure
-
-
-_structures: dict[type, Any] = {}
-"""The last structure of a policy of each class, for `_check_policy`."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -80,6 +81,9 @@ class Hooks:
     stop: Callable[[], bool] = lambda: False
     """Called after each chunk; if it returns true, the run is saved and ends."""
 
+    note: Callable[[str], None] = lambda _: None
+    """Called with a line of text on damaged files."""
+
 
 def prepare_folder(
     folder: Path, config: TrainConfig | None, resume: bool, overrides: tuple[str, ...] = ()
@@ -119,12 +123,33 @@ def _others(folder: Path) -> bool:
 
 
 @for_traces
+def begin_compiling(config: TrainConfig, env: Any) -> Future[Any]:
+    """Compiles the training loop in another thread: XLA compiles one program on little more than one core."""
+    lowered = run_agents.lower(config.sac, config.loop, env, _shapes(config, env))
+    other = ThreadPoolExecutor(1)
+    compiled = other.submit(lowered.compile)
+    other.shutdown(wait=False)
+    return compiled
+
+
+def _keys(config: TrainConfig) -> Any:
+    """Random keys of the agents; scenes have another one."""
+    return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(config.seed), 1 + jnp.arange(config.seeds))
+
+
+def _shapes(config: TrainConfig, env: Any) -> Any:
+    """Those of the loop's state."""
+    return jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, _keys(config)))
+
+
+@for_traces
 def train(
     config: TrainConfig,
     env: Any,
     evaluate: Callable[[Any], Mapping[str, float]],
     folder: Path,
     hooks: Hooks | None = None,
+    loop: Future[Any] | None = None,
 ) -> Outcome:
     """Trains to the end, from the last checkpoint in the folder if there is one.
 
@@ -134,11 +159,12 @@ def train(
         evaluate: metrics of an actor's parameters by their names in the log, deterministic; `SCORE` is one of them.
         folder: see `prepare_folder`.
         hooks: callbacks.
+        loop: of `begin_compiling`; None: it is called now.
 
     Raises:
         TrainError: losses or all transitions are not finite, or no checkpoint can be used or written.
     """
-    run = _Run(config, env, evaluate, folder, hooks or Hooks())
+    run = _Run(config, env, evaluate, folder, hooks or Hooks(), loop or begin_compiling(config, env))
     try:
         return run.finish()
     finally:
@@ -148,30 +174,27 @@ def train(
 class _Run:
     """A run between two chunks."""
 
-    def __init__(self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks) -> None:
+    def __init__(
+        self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks, loop: Future[Any]
+    ) -> None:
         self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
         self.folder = folder / CHECKPOINTS
         self.chunk, self.wall_s = 0, 0.0
         self.evaluated = 0  # chunk after which the agents were evaluated last
         self.best: tuple[Best, ...] = ()
-        like: Any = jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, self._keys()))
+        like = _shapes(config, env)
+        hooks.stage("compiling the training loop")
         if checkpoint.steps(self.folder):
             self._restore_latest(like)
         else:
             self._begin(like)
-        hooks.stage("compiling the training loop")
-        self._compiled = run_agents.lower(config.sac, config.loop, self.env, self.state).compile()
-        self.log = Log(folder, self.chunk, hooks.stage)
-
-    def _keys(self) -> Any:
-        """Random keys of the agents; scenes have another one."""
-        return jax.vmap(jax.random.fold_in, (None, 0))(
-            jax.random.key(self.config.seed), 1 + jnp.arange(self.config.seeds)
-        )
+        evaluate(_agent(self.state.learner.actor, 0))  # compiles its programs
+        self._compiled = loop.result()
+        self.log = Log(folder, self.chunk, hooks.note)
+        hooks.stage("training")
 
     def _begin(self, like: Any) -> None:
-        self.hooks.stage("filling the replay buffer")
-        fresh = start_agents(self.config.sac, self.config.loop, self.env, self._keys())
+        fresh = start_agents(self.config.sac, self.config.loop, self.env, _keys(self.config))
         self.state: LoopState = checkpoint.unpack(
             checkpoint.pack(fresh), like
         )  # the same memory layout as after a checkpoint
@@ -195,7 +218,7 @@ class _Run:
                 reasons.append(str(error))
                 continue
             if reasons:
-                self.hooks.stage(f"{reasons[0]}; going on from the one before, after chunk {metadata[0]}")
+                self.hooks.note(f"{reasons[0]}; going on from the one before, after chunk {metadata[0]}")
             return metadata, arrays
         others = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise TrainError(f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder")

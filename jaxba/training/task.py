@@ -147,15 +147,18 @@ def build(
     folder: Path,
     report: Callable[[str], None] = lambda _: None,
     baselines: Sequence[str] | None = None,
+    on_game: Callable[[Game], Any] = lambda _: None,
 ) -> Task:
     """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. `report` is called with a
     line of text when something begins that takes a while; `baselines` are names to compare with, unless the folder has
-    their results already; `BASELINES` if None. Raises ValueError: too few scenes are usable, or another version wrote
-    the files; one line for a person. Raises OSError: the folder cannot be written or read."""
+    their results already; `BASELINES` if None; `on_game` is called with the game before they are played. Raises
+    ValueError: too few scenes are usable, or another version wrote the files; one line for a person. Raises OSError:
+    the folder cannot be written or read."""
     splits = _splits(config, folder, report)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
+    on_game(game)
     runs = _baseline_runs(config, folder, game, held_out, report, baselines)
     return Task(config, game, held_out, runs)
 
@@ -188,7 +191,7 @@ def _baseline_runs(
     if CONSTANT in names:
         rules, banks = config.game, first_scenes(game.banks, held_out)
         limits = rules.tolerance, rules.max_iterations
-        found = best_constant_action(config.bank.classes, banks, rules.agent, game.options, *limits)
+        found = best_constant_action(config.bank.classes, banks, rules.agent, game.options, *limits, policies)
         policies[CONSTANT] = found, game.options
     runs = play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
     _write_runs(path, runs)

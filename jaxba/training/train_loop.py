@@ -173,7 +173,7 @@ def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
     return jnp.sum(errors) / jnp.sum(known, dtype=jnp.float32)
 
 
-@functools.partial(jit, static_argnames=("sac", "loop"))
+@functools.partial(jit, once=True, static_argnames=("sac", "loop"))
 def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
     """`start` for several agents, one for each key, which share the environment's scenes; the state has a first axis of
     agents."""

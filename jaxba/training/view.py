@@ -23,19 +23,25 @@ SAME = 0.1
 
 
 def lines(
-    rows: Sequence[Row], chunks: int, rules: Mapping[str, Any], best: bool = False, decades: float = 5.5
+    rows: Sequence[Row],
+    chunks: int,
+    rules: Mapping[str, Any],
+    best: bool = False,
+    decades: float = 5.5,
+    left_s: float = 0.0,
 ) -> list[str]:
     """A line on a finished chunk and one on the agents' health, and one on held-out scores if there are any. The last
     one is a warning if there are scores, and some agents' policies are the same everywhere or random. Rows are those of
     one chunk in the log, one of every agent, of so many chunks in all; `rules` has a `Score` by name of the baseline.
-    `best`: whether a policy of this chunk is the best so far. `decades`: of lambda that an action of 1 is above 0."""
+    `best`: whether a policy of this chunk is the best so far. `decades`: of lambda that an action of 1 is above 0.
+    `left_s`: seconds that the other chunks will take."""
     row = rows[0]
-    start, end = f"chunk {row['chunk']}/{chunks}: ", row["wall_s"] / row["chunk"] * chunks
+    start = f"chunk {row['chunk']}/{chunks}: "
     text = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
     if ended := [one for one in rows if one["episodes"]]:
         length, rule = _mean(ended, "episode/length"), _mean(ended, "episode/ceres")
         text += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
-    found = [f"{start}{text}, {row['wall_s']:.0f} s of {end:.0f}", start + _health(rows, decades)]
+    found = [f"{start}{text}, about {left_s:.0f} s left", start + _health(rows, decades)]
     values = [one["held_out/score"] for one in rows if one.get("held_out/score") is not None]
     if values:
         text = f"held out {_mean(rows, 'held_out/score'):.2f} iterations"

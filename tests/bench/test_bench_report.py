@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from jaxba.bench import charts
-from jaxba.bench.pictures import picture
 from jaxba.bench.profile import Target
 from jaxba.bench.report import run_metadata, to_html, write_all
 from jaxba.bench.summary import summarize
@@ -69,21 +68,7 @@ def page_of(records, tolerance=1e-3, **metadata):
 def test_write_all_writes_the_documented_files(tmp_path):
     records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
     files = write_all(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
-    assert names(tmp_path / "out") == {"summary.json", "report.html", "profile.png"} == {path.name for path in files}
-    assert files[2].read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_picture_of_a_profile_has_the_curves_of_the_chart():
-    records = [make_record("a", "x", 12, rate=0.1), make_record("a", "y", 12, rate=0.37)]
-    styles = charts.solver_styles(["x", "y"])
-    chart = charts.profile_chart(records, Target("relative", 1e-2), styles)
-    by_iterations, by_time = picture(chart).axes
-    assert (by_iterations.get_xscale(), by_time.get_xscale()) == ("log", "log")
-    for line, solver, trace in zip(by_iterations.get_lines(), ("x", "y"), chart["data"], strict=True):
-        assert line.get_color() == styles[solver].color
-        np.testing.assert_array_equal(
-            line.get_xydata(), np.transpose([trace["x"]["iterations"], trace["y"]["iterations"]])
-        )
+    assert names(tmp_path / "out") == {"summary.json", "report.html"} == {path.name for path in files}
 
 
 def test_report_is_self_contained_well_formed_and_escaped():
@@ -175,6 +160,20 @@ def test_convergence_charts_have_dashed_lines_at_the_tolerances():
     heights = lambda chart: sorted(shape["y0"] for shape in chart["layout"]["shapes"])
     assert heights(cost) == pytest.approx([100.9, 109.0, 190.0])
     assert heights(distance) == pytest.approx([1e-4, 1e-3, 1e-2])
+
+
+def test_labels_of_dashed_lines_stand_beside_the_chart():
+    cost = charts.problem_charts([make_record("a", "x", 30)], "a", 1e-2, charts.solver_styles("x"))[0]["layout"]
+    assert [note["text"] for note in cost["annotations"]] == ["τ = 0.001<br>τ = 0.01", "τ = 0.1"]
+    assert {(note["x"], note["xanchor"]) for note in cost["annotations"]} == {(1, "left")}
+    assert cost["margin"]["r"] > 50
+
+
+def test_a_single_problem_has_no_performance_profile():
+    records = [make_record("a", "x", 30), make_record("a", "y", 12)]
+    assert "Performance profiles" not in page_of(records)[0]
+    chart = charts.profile_chart(records, Target("tau", 0.1), charts.solver_styles(["x", "y"]))
+    assert chart["layout"]["yaxis"]["range"] == [0.0, 100.0]
 
 
 def test_metadata_come_from_the_records_if_none_are_given():

@@ -65,24 +65,10 @@ def test_unrun_problems_count_as_unreached_and_are_reported(records):
     assert summary.warnings == ["ceres was run on 2 of 3 problems; the others count as not reached"]
 
 
-def test_comparisons_use_the_problems_that_both_reached(records):
-    against = solver(summarize(records), "learned").against
-    assert set(against) == {"classic", "ceres"}
-    item = against["classic"]["converged"]
-    assert (item.both, item.only_solver, item.only_yardstick) == (2, 0, 1)
-    assert item.iterations == pytest.approx(0.5)  # sqrt(2/16 * 8/4)
-    assert item.seconds == pytest.approx(1.0)  # sqrt(4/16 * 16/4)
-    assert solver(summarize(records), "classic").against["ceres"]["converged"].only_solver == 1
-    assert "classic" not in solver(summarize(records), "classic").against
-
-
-def test_ends_rejections_and_failures(records):
+def test_the_worst_end_and_all_compilation(records):
     learned = solver(summarize(records), "learned")
     assert learned.final_ratio_worst == pytest.approx(4.0)
-    assert learned.final_ratio_mean == pytest.approx((1.005 * 1.0 * 4.0) ** (1 / 3))
-    assert learned.rejected_share == pytest.approx((110 - 3) / 110)
-    assert learned.linear_failure_share == pytest.approx(3 / 110)
-    assert (learned.seconds_per_iteration, learned.compile_s) == (2.0, 3.0)
+    assert learned.compile_s == 9.0
 
 
 def test_cells_hold_medians_over_repeats():
@@ -100,7 +86,6 @@ def test_solver_that_fails_everywhere_has_no_mean_but_a_capped_one():
     assert (end.reached, end.iterations_capped) == (0, pytest.approx(100.0))
     assert math.isnan(end.iterations)
     assert math.isnan(end.seconds)
-    assert math.isnan(solver(summarize(records), "x").against["classic"]["converged"].iterations)
 
 
 def test_geometric_mean_of_special_values():
@@ -125,7 +110,7 @@ def test_summary_file_is_json_without_nan_and_replaces_the_old_one(tmp_path, rec
     assert [target["key"] for target in data["targets"][:3]] == ["tau_0.1", "tau_0.01", "tau_0.001"]
     assert data["metadata"] == {"threads": 2, "where": str(tmp_path)}
     row = next(s for s in data["solvers"] if s["solver"] == "learned")
-    assert row["against"]["classic"]["converged"]["both"] == 2
+    assert row["targets"]["converged"]["reached"] == 2
     assert data["cells"][-1]["reach"]["converged"] == {"iterations": None, "seconds": None}
     assert data == to_json(summarize(records, 1e-2, metadata={"threads": 2, "where": tmp_path}))
     assert [p.name for p in tmp_path.iterdir()] == ["summary.json"]
@@ -140,25 +125,21 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def printed(summary, details=True):
+def printed(summary):
     stream = io.StringIO()
-    print_summary(summary, Console(file=stream, width=200), details)
+    print_summary(summary, Console(file=stream, width=100))
     return stream.getvalue()
 
 
 def test_what_is_printed_holds_every_solver_under_its_own_name(records):
-    odd = make_record("a|[b]", "policy|[red]*.safetensors", 3)
+    odd = make_record("a|[b]", "p|[red]*", 3)
     summary = summarize([*records, odd])
-    text = printed(summary)
-    assert "policy|[red]*.safetensors" in text
-    assert "0.5 / 1 (2 -1)" in text
-    assert re.search(r"learned +│ +2/4 +│ +4 ", text)
-    assert "\nProblems" in text
-    assert "\nProblems" not in printed(summary, details=False)
+    assert "\n p|[red]* " in printed(summary)
+    assert re.search(r"\n learned +53.2 +16 +1/4 +20 +2/4 +4 +9\.0", printed(summary))
 
 
 def test_no_records_make_an_empty_summary():
     summary = summarize([])
     assert summary.solvers == []
     assert json.dumps(to_json(summary), allow_nan=False)
-    assert "Solvers" in printed(summary)
+    assert "converged" in printed(summary)

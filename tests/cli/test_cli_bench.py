@@ -21,6 +21,8 @@ from jaxba.cli.bench import run
 from jaxba.damping.learned import without_weights
 from jaxba.damping.registry import SHIPPED
 from jaxba.problem import geometry
+from jaxba.scenes import DEFAULT_SCENES
+from jaxba.structure.padding import capacity_of
 
 KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
@@ -213,6 +215,23 @@ def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undra
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
 
 
+def test_another_command_gets_a_folder_of_its_own_and_the_same_one_goes_on(tmp_path, undrawn, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    brief, places = ["scene:tiny", "--repeats", "1", "--max-iterations", "1", "--solvers"], Path("runs")
+    assert run([*brief, "ceres"]) == run([*brief, "classic"]) == run([*brief, "ceres"]) == 0
+    assert [line["solver"] for line in lines(places / "bench")] == ["ceres"]
+    assert [line["solver"] for line in lines(places / "bench-2")] == ["classic"]
+    (places / "bench" / "results.jsonl").write_text("damaged\n")
+    assert run([*brief, "ceres"]) == 0
+    assert [line["solver"] for line in lines(places / "bench-3")] == ["ceres"]
+
+
+def test_the_default_scenes_share_programs():
+    capacities = {capacity_of(jaxba.random_scene(scene, 0)) for scene in DEFAULT_SCENES.values()}
+    assert len(capacities) == 1
+    assert None not in capacities
+
+
 def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(2 * path.read_bytes())
@@ -283,7 +302,7 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
     assert bench(tmp_path / "run[bold]", *argv) == 0
     out = capsys.readouterr().out
-    assert "\nseq[red]:cat: ceres #1: 1 iteration," in f"\n{out}"
+    assert "\nseq[red]:cat:: 1 run in " in f"\n{out}"
     assert str(tmp_path / "run[bold]" / "report.html") in out
 
 
@@ -325,6 +344,73 @@ def test_the_final_costs_of_float32_are_computed_in_float64(tmp_path, undrawn, c
     assert rough["final_cost"] == pytest.approx(rough["trace"][-1]["cost"], rel=1e-4)
 
 
+RULES = """
+import dataclasses
+import jax.numpy as jnp
+import jaxba
+
+@jaxba.register_pytree
+@dataclasses.dataclass(frozen=True)
+class Same:
+    min_gain: float = 0.0
+
+    def init(self, info):
+        return (), jnp.asarray(1e-4, info.cost.dtype)
+
+    def propose(self, state, step):
+        return state, step.damping
+
+@jaxba.register_pytree
+@dataclasses.dataclass(frozen=True)
+class Branching(Same):
+    def propose(self, state, step):
+        return state, step.damping if step.accepted else 2 * step.damping
+
+@dataclasses.dataclass(frozen=True)
+class Unregistered(Same):
+    pass
+
+class Needy(Same):
+    def __init__(self, wish):
+        pass
+"""
+
+
+def test_a_rule_in_a_file_is_run_like_others_and_its_fault_is_one_line(tmp_path, undrawn, capsys):
+    path = tmp_path / "my+rules@1.py"
+    path.write_text(RULES)
+    names = [f"{path}:Same", f"{path}:Same+refine1", "constant:1e-4", f"{path}:Branching"]
+    status = bench(tmp_path / "run", "scene:tiny", "--solvers", ",".join(names), *BRIEF[2:])
+    check_one_line(status, capsys.readouterr().err, f"{path}, line 21: TracerBoolConversionError: ")
+    own, refined, constant = lines(tmp_path / "run")
+    assert [own["solver"], refined["solver"]] == names[:2]
+    assert own["final_cost"] == pytest.approx(constant["final_cost"], rel=1e-9)
+    assert refined["trace"][1]["cost"] < own["trace"][1]["cost"]
+    path.write_text(RULES + "# changed\n")
+    check_one_line(
+        bench(tmp_path / "run", "scene:tiny", "--solvers", names[0], *BRIEF[2:]), capsys.readouterr().err, "another"
+    )
+
+
+BAD_RULES = {
+    "None": "rules.py has no class None",
+    "Unregistered": "rules.py: ValueError: policy Unregistered is no pytree: decorate",
+    "Needy": "missing 1 required positional argument: 'wish'",
+    "jnp": "rules.py: TypeError: 'module' object is not callable",
+}
+
+
+@pytest.mark.parametrize("name", BAD_RULES)
+def test_a_class_that_is_no_rule_is_one_line_and_status_2(name, tmp_path, capsys):
+    path = tmp_path / "rules.py"
+    path.write_text(RULES)
+    check_one_line(bench(tmp_path / "run", "--solvers", f"{path}:{name}"), capsys.readouterr().err, BAD_RULES[name])
+    path.write_text("1 +")
+    check_one_line(
+        bench(tmp_path / "run", "--solvers", f"{path}:{name}"), capsys.readouterr().err, "rules.py: SyntaxError"
+    )
+
+
 def suite(tmp_path: Path, **entries) -> str:
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump(entries))
@@ -350,6 +436,7 @@ BAD = {
     "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
     "mixed types of a method": (["scene:tiny", "--solvers", "ceres,stba+ceres@mixed"], "mixed types are for plain LM"),
+    "missing rule": (["scene:tiny", "--solvers", "no.py:Rule"], "no.py: No such file"),
     "missing policy": (["scene:tiny", "--solvers", "no.safetensors"], "no.safetensors: No such file"),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),

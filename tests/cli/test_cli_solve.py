@@ -118,7 +118,7 @@ def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
 def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert run([]) == 0
     printed = capsys.readouterr()
-    assert "random scene street-40: 40 cameras, 4000 points, " in printed.out
+    assert "random scene street: 20 cameras, 1500 points, " in printed.out
     assert "\nconverged: " in printed.out
     assert printed.err == ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -91,7 +92,7 @@ def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
     out = str(tmp_path / "run")
     assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
     assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
-    assert "known: default, paper, paper-tuned" in error_of(capsys, "--config", "fast", "--out", out)
+    assert "known: default, fast, paper, paper-tuned" in error_of(capsys, "--config", "best", "--out", out)
     assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
     assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
     assert not (tmp_path / "run").exists()
@@ -133,6 +134,14 @@ def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
     output = capsys.readouterr().out
     for name in ("trained", "ceres", "virtual best", "policy.safetensors"):
         assert name in output
+    for stage in (
+        "starting",
+        "compiling the training loop",
+        "training",
+        "comparing with the rules",
+        "episodes and page",
+    ):
+        assert re.search(rf"^{stage}: [\d.]+ s$", output, re.MULTILINE)
     assert (finished / "metrics.jsonl").read_bytes() == before
 
 

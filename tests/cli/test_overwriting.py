@@ -69,7 +69,7 @@ CASES = [
     (kitti, "kitti --poses kitti/poses.txt --out kitti/poses.txt", "--out kitti/poses.txt: is the file of --poses"),
     (kitti, "kitti --out kitti/calib.txt", "kitti/calib.txt: is a file of the sequence"),
     (kitti, "kitti --out kitti/times.txt", "kitti/times.txt: is a file of the sequence"),
-    (bench, "scene:street-40 --suite run/settings.json --out run", "is the file of --suite"),
+    (bench, "scene:street --suite run/settings.json --out run", "is the file of --suite"),
     (train, "--config run/config.yaml --out run", "--out run/config.yaml: is the file of --config"),
     (paper, "--config own.yaml --report own.yaml", "--report own.yaml: is the file of --config"),
 ]

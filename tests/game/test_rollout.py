@@ -17,6 +17,7 @@ from jaxba.damping.features import observation_size
 from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
 from jaxba.game.groups import GROUP, step_groups
+from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import (
     MOST_CAMERAS,
     MOST_POINTS,
@@ -218,6 +219,18 @@ def test_the_best_constant_action_has_the_fewest_iterations():
         for action in CONSTANT_ACTIONS
     ]
     assert means[CONSTANT_ACTIONS.index(best.action[0])] == min(means) < max(means)
+
+
+def test_policies_that_share_a_program_play_as_they_do_alone():
+    bank, names = tiny_bank(), ("ceres", "constant:1e-3", "gtsam", "constant:1e-5")
+    alone = {name: play(KIND, bank, make_policy(name), StepOptions(), LIMIT) for name in names[:2]}
+    steps = alike({name: (make_policy(name), StepOptions()) for name in names})
+    assert len({jax.tree.structure(policy) for policy, _ in steps.values()}) == 1
+    for name, one in alone.items():
+        found = play(KIND, bank, *steps[name], LIMIT)
+        np.testing.assert_array_equal(found.iterations, one.iterations)
+        np.testing.assert_allclose(found.dampings, one.dampings, rtol=1e-6)
+        np.testing.assert_allclose(found.costs, one.costs, rtol=1e-9)
 
 
 def test_an_evaluation_is_the_score_of_playing():

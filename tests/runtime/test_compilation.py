@@ -18,7 +18,6 @@ from jaxba.cli.solve import run
 from jaxba.io import write_problem
 from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.problem.options import Refinement, StepOptions
-from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
     BREAK_EVEN,
     TYPICAL,
@@ -30,6 +29,7 @@ from jaxba.runtime.compilation import (
     program,
     quick_iterations,
 )
+from jaxba.runtime.jit import quick_options
 from jaxba.solver.stepwise import try_step_by_parts
 
 pytestmark = pytest.mark.step
@@ -226,8 +226,8 @@ def test_iterations_of_alternating_solves_are_added():
 
 
 def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
-    monkeypatch.setattr(compilation, "QUICK", {"xla_no_such_option": True})
-    assert compiler_options.__wrapped__("quick") == {}
+    monkeypatch.setattr("jaxba.runtime.jit.QUICK", {"xla_no_such_option": True})
+    assert quick_options.__wrapped__() == {}
 
 
 @on_a_cpu
@@ -235,8 +235,8 @@ def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
 def test_an_unknown_option_leaves_those_that_are_known(unknown_first, monkeypatch):
     known = {"xla_backend_optimization_level": 0}
     options = {"xla_no_such_option": True, **known} if unknown_first else {**known, "xla_no_such_option": True}
-    monkeypatch.setattr(compilation, "QUICK", options)
-    assert compiler_options.__wrapped__("quick") == known
+    monkeypatch.setattr("jaxba.runtime.jit.QUICK", options)
+    assert quick_options.__wrapped__() == known
 
 
 def test_an_unknown_choice_is_refused_in_one_line(unchecked):

@@ -33,7 +33,7 @@ def refused(*overrides: str, name: str = "default") -> str:
 
 
 def test_the_presets_are_those_that_the_documentation_names():
-    assert set(configurations.names("train")) == {"default", "paper", "paper-tuned"}
+    assert set(configurations.names("train")) == {"default", "fast", "paper", "paper-tuned"}
 
 
 @pytest.mark.parametrize("name", configurations.names("train"))

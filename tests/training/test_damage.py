@@ -41,7 +41,7 @@ def folder(six, tmp_path) -> Path:
 def resumed(folder: Path) -> tuple[Outcome, list[str]]:
     said: list[str] = []
     config = driver.prepare_folder(folder, LONGER, True)
-    return driver.train(config, toys.SEEN, evaluate, folder, driver.Hooks(stage=said.append)), said
+    return driver.train(config, toys.SEEN, evaluate, folder, driver.Hooks(note=said.append)), said
 
 
 def cut(path: Path) -> None:

@@ -35,8 +35,8 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
 
 
 def test_a_chunk_has_a_line_and_its_held_out_scores_another():
-    first, health, second, warning = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True, decades=6.0)
-    assert first == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), 2 s of 6"
+    first, health, second, warning = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True, decades=6.0, left_s=5.2)
+    assert first == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), about 5 s left"
     assert second.startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
     assert second.endswith(", failures 1.0 % (ceres 6.00, ceres+embedded 5.00), best on training scenes so far")
     spread = "spread of log10(lambda) over states"

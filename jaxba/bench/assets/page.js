@@ -15,7 +15,7 @@ function themed() {
   const hoverlabel = { bgcolor: dark ? "#24292e" : "#ffffff", font: { color: font.color, size: 12 }, align: "left" };
   const modebar = { bgcolor: "rgba(0,0,0,0)", color: dark ? "#8a9097" : "#9aa0a6", activecolor: font.color };
   return { layout: { modebar, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font, hoverlabel, xaxis: axis,
-    yaxis: axis, showlegend: false, hovermode: "closest", margin: { l: 62, r: 20, t: 26, b: 44 } } };
+    yaxis: axis, showlegend: false, hovermode: "x unified", hoverdistance: -1, margin: { l: 62, r: 20, t: 26, b: 44 } } };
 }
 
 // What is black on white is white on black.
@@ -31,6 +31,7 @@ function draw(chart) {
     return { ...trace, x: chosen(trace.x), y: chosen(trace.y) };
   });
   const xaxis = { ...chart.layout.xaxis, ...((chart.xaxes || {})[state.axis] || {}) };
+  if (xaxis.title) xaxis.unifiedhovertitle = { text: `${xaxis.title.text}: %{x:.4~g}` };
   Plotly.react(box, traces, { ...chart.layout, xaxis, template: themed(), uirevision: state.axis },
     { responsive: true, displaylogo: false, plotlyServerURL: "", // without the button that sends a chart to a server
       toImageButtonOptions: { format: "svg", filename: chart.title },

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from jaxba.datasets import EXAMPLE
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.process import user_cache
 
@@ -106,8 +107,10 @@ def local_path(name: str) -> Path:
 
 
 def resolve(location: str) -> str:
-    """The path of a problem's name, such as ladybug-49, if no file is called so; every other location as it is. Raises
-    ProblemError: as `local_path` does, for a location that has the form of a name."""
+    """The path of a problem's name, such as ladybug-49 or `example`, if no file is called so; every other location as
+    it is. Raises ProblemError: as `local_path` does, for a location that has the form of a name."""
+    if location == EXAMPLE.name.partition(".")[0] and not os.path.lexists(location):
+        return str(EXAMPLE)
     if _NAME.fullmatch(location) and not os.path.lexists(location):
         return str(local_path(location))
     return location
