@@ -96,7 +96,13 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
 
         if out_of_memory(error):
             return print_error("not enough memory")
-        _end_if_alone(error)
+        from jaxba.runtime.distributed import has_lost_process
+
+        if has_lost_process(error):  # JAX would wait for it
+            status = print_error("another process of this run has ended, and so does this one")
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
         if missing := missing_platform():
             return print_error(
                 f"JAX_PLATFORMS is {missing!r}, but JAX has no such platform on this machine: unset it, or set cpu"
@@ -104,17 +110,6 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
         if isinstance(error, OSError) and error.errno in FULL:
             return print_error(f"{error.filename or 'a file'}: {error.strerror}")
         raise
-
-
-def _end_if_alone(error: Exception) -> None:
-    """Ends this process with one line if another one of the run has ended, for which JAX would wait."""
-    from jaxba.runtime.distributed import has_lost_process
-
-    if has_lost_process(error):
-        status = print_error("another process of this run has ended, and so does this one")
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
 
 
 def counted(count: int, noun: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.damping import ConstantAction, DampingPolicy
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.game.env import GameConfig
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, reach
@@ -77,19 +77,13 @@ CONSTANT_ACTIONS = tuple(float(x) for x in np.linspace(-1.0, 1.0, 12))
 
 
 def best_constant_action(
-    kinds: Sequence[SceneClass],
-    banks: Sequence[Bank],
-    config: AgentConfig,
-    options: StepOptions,
-    tolerance: float,
-    limit: int,
+    kinds: Sequence[SceneClass], banks: Sequence[Bank], rules: GameConfig, options: StepOptions
 ) -> ConstantAction:
-    """The constant action with the fewest mean iterations: what an agent must beat to have learned something.
-
-    The banks are those of training; `config` says what an action means, for the rest see `evaluate`.
-    """
-    tried = [ConstantAction((action,), config) for action in CONSTANT_ACTIONS]
-    return min(tried, key=lambda one: evaluate(kinds, banks, one, options, tolerance, limit).mean)
+    """The constant action with the fewest mean iterations: what an agent must beat to have learned something. The banks
+    are those of training."""
+    tried = [ConstantAction((action,), rules.agent) for action in CONSTANT_ACTIONS]
+    limits = rules.tolerance, rules.max_iterations
+    return min(tried, key=lambda one: evaluate(kinds, banks, one, options, *limits).mean)
 
 
 Runs = list[Trajectories]

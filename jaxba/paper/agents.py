@@ -161,9 +161,8 @@ def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Calla
     if not path.is_file():
         report(f"{agent.name}: best constant action")
         work, played = game_of(config, agent, folder, report)
-        banks, rules = task.first_scenes(played.banks, work.held_out), played.config
-        limits = rules.tolerance, rules.max_iterations
-        found = best_constant_action(played.kinds, banks, rules.agent, played.options, *limits)
+        banks = task.first_scenes(played.banks, work.held_out)
+        found = best_constant_action(played.kinds, banks, played.config, played.options)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_policy(path, always(found.action[0], found.config))
     return path

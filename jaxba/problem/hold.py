@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from jaxba.problem.checks import shown
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.options import check_known
 from jaxba.problem.preprocess import observed
 from jaxba.problem.residuals import Residuals
 
@@ -99,8 +100,7 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
         ValueError: no such gauge.
         ProblemError: fewer than two cameras, or three points, are observed.
     """
-    if gauge not in get_args(Gauge):
-        raise ValueError(f"gauge must be one of {', '.join(get_args(Gauge))}, not {gauge!r}")
+    check_known("gauge", gauge, Gauge)
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)

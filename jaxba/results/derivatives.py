@@ -49,6 +49,7 @@ from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY, set_up
 from jaxba.solver.solve import solve
 from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import take
 from jaxba.typing import AnyArray, differ, outline, same
 
 DAMPING = 1e-10
@@ -313,7 +314,9 @@ def _gauss_newton(
     def inverse(right: tuple[Array, Array]) -> tuple[Array, Array]:
         solved = [-x for x in system.points.factor.forward(list(right[1]))]
         own = system._replace(points=system.points._replace(solved=solved))
-        own = own._replace(cameras=own.cameras._replace(right=right[0] + lift_to_cameras(own)))
+        at_slots = take(jnp.stack(solved), layout.slot_point)
+        lifted = lift_to_cameras(layout, linear, own.points.projected, at_slots)
+        own = own._replace(cameras=own.cameras._replace(right=right[0] + lifted))
         step, _ = solve_reduced(own, options)
         return step, jnp.stack(back_substitute(own, step))
 
