@@ -43,9 +43,9 @@ def run_command(
     argv: Sequence[str] | None,
     subcommand: str = "",
 ) -> int:
-    """Parses the command line and runs `main`.
-
-    Expected errors are printed as one line to stderr, and so is a Ctrl-C or SIGTERM that `main` does not handle.
+    """Parses the command line and runs `main`. Expected errors are printed as one line to stderr, and so is a Ctrl-C or
+    SIGTERM that `main` does not handle. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or
+    143 after SIGTERM.
 
     Args:
         arguments: class of the arguments, made by `options`, in the module that has the command's name.
@@ -53,9 +53,6 @@ def run_command(
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
         subcommand: for the help, if `argv` is without it.
-
-    Returns:
-        The exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
     """
     with Interrupt() as interrupt, tolerant_streams():
         try:

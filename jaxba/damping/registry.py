@@ -52,15 +52,9 @@ CONSTANT = "constant"
 
 
 def make_policy(name: str) -> DampingPolicy:
-    """The policy called `name`.
-
-    Args:
-        name: `learned`; the path of a policy file; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one;
-            or `constant:LAMBDA`.
-
-    Raises:
-        InputError: no such policy, a lambda that is not a positive number, or a path that is not of a policy file.
-    """
+    """The policy called `name`: `learned`; the path of a policy file; a key of `POLICIES`, with `:FIRST_LAMBDA` for
+    rules that have one; or `constant:LAMBDA`. Raises InputError: no such policy, a lambda that is not a positive
+    number, or a path that is not of a policy file."""
     if is_learned(name):
         return load_policy(SHIPPED if name == LEARNED else name)
     base, colon, number = name.partition(":")

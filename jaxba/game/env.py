@@ -285,15 +285,8 @@ def make_game(
     envs: Sequence[int],
     options: StepOptions | None = None,
 ) -> Game:
-    """A game on banks of scenes.
-
-    Args:
-        config: rules.
-        kinds: classes of the banks.
-        banks: scenes.
-        envs: environments of each class.
-        options: of the LM step; the agent's configuration overrides them (`AgentConfig.step_options`).
-    """
+    """A game on banks of scenes, each of a class and with so many environments; `config` are its rules. The agent's
+    configuration overrides the `options` of the LM step (`AgentConfig.step_options`)."""
     options = config.agent.step_options(options or StepOptions())
     for kind in kinds:
         class_layout(kind, options)  # cached on the host before anything is traced

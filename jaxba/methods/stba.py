@@ -112,14 +112,8 @@ def consensus_gradient(
         g_k <- D_k (sum_j g_j) / (sum_j D_j)
 
     These are the nearest such gradients in the metric of `D^-1`: the closed form of the published projection
-    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica.
-
-    Args:
-        layout: the problem's observations.
-        partition: the partition of this iteration.
-        diagonal: D, diagonal of the damped block of each replica.
-        gradient: g of each replica.
-    """
+    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica. `diagonal` is D, the diagonal of
+    the damped block of each replica in the partition of this iteration, and `gradient` is its g."""
     # Sums over the replicas of a point run over its slots, with weights that sum to one for each replica.
     count = tree_sum(jnp.asarray(layout.slot_mask, gradient.dtype)[:, None], partition.levels)[:, 0]
     weight = jnp.where(count > 0, 1 / jnp.maximum(count, 1), 0)

@@ -125,20 +125,9 @@ def own_folder(agent: Agent, folder: Path) -> Path:
 
 
 def train(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> bool:
-    """Trains an agent if the folder does not have its policies yet.
-
-    Args:
-        config: configuration of the reproduction run.
-        agent: the agent.
-        folder: folder of the reproduction run.
-        report: called with a line of text when something starts.
-
-    Returns:
-        Whether it was trained by this call.
-
-    Raises:
-        InputError: the training cannot start or continue; the message is one line.
-    """
+    """Trains an agent if the folder of the reproduction run does not have its policies yet; `report` is called with a
+    line of text when something starts. Returns whether it was trained by this call. Raises InputError: the training
+    cannot start or continue; the message is one line."""
     own = own_folder(agent, folder)
     files = [own / POLICY.format(seed + 1) for seed in range(config.agents.seeds)]
     if all(file.is_file() for file in files):

@@ -43,7 +43,7 @@ def hold(
     numbers: Iterable[str] = (),
     extrinsics: Which = (),
 ) -> BundleProblem:
-    """The problem with more of it constant.
+    """The problem with more of it constant. Raises ValueError: no such image, lens, point or number; one line.
 
     Args:
         problem: any problem.
@@ -54,9 +54,6 @@ def hold(
         numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
             camera model such as `k2`.
         extrinsics: lenses whose place in their rig is constant; of no effect without rigs.
-
-    Raises:
-        ValueError: no such image, lens, point or number; one line.
     """
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
     constants.poses[_mask(problem, poses, problem.num_cameras, "image")] = True
@@ -95,11 +92,7 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     `BundleAdjustmentGauge`.
 
     In a scene far from the origin (`preprocess.FAR`) the number of a translation is that of the scene shifted to it.
-
-    Raises:
-        ValueError: no such gauge.
-        ProblemError: fewer than two cameras, or three points, are observed.
-    """
+    Raises ValueError: no such gauge. Raises ProblemError: fewer than two cameras, or three points, are observed."""
     check_known("gauge", gauge, Gauge)
     if gauge == "free":
         return problem

@@ -123,11 +123,8 @@ class SolveOptions:
                 raise ValueError(f"{name} must not be negative, is {value}")
 
     def step_options(self, policy: DampingPolicy) -> StepOptions:
-        """The step options for a policy. The linear solver `auto` is replaced by `explicit`, to be chosen later.
-
-        Raises:
-            ValueError: options that exclude each other, or an unknown method.
-        """
+        """The step options for a policy. The linear solver `auto` is replaced by `explicit`, to be chosen later. Raises
+        ValueError: options that exclude each other, or an unknown method."""
         trained = trained_step(policy)
         method = make_method(self.method) if isinstance(self.method, str) else self.method
         step = method.options(
