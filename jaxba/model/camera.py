@@ -128,9 +128,8 @@ def derivatives(
 ) -> tuple[list[list[Array]], list[list[Array]]]:
     """Jacobians of `project` by the camera (rotation on the manifold, translation, lens), [2][width] of [n], and by the
     point, [2][3] of [n]: columns, each of which is one fused expression. `projection` is what `project` returned for
-    these cameras. `columns` are the numbers of the lens, and then of extrinsics, to differentiate by; None: all.
-
-    dz/dt = dz/dP dz/dw = -dz/dP [R X]x dz/dX = dz/dP R"""
+    these cameras. `columns` are the numbers of the lens, and then of extrinsics, to differentiate by; None: all. By the
+    chain rule `dz/dt = dz/dP`, `dz/dw = -dz/dP [R X]x` and `dz/dX = dz/dP R`."""
     rows, by_lens = frame.model.derivatives(list(frame.lens), frame.which, projection)
     by_number = [functools.partial(by_lens, k) for k in range(len(frame.lens))]
     for place, turned in zip(reversed(frame.places), reversed(projection.turned), strict=True):

@@ -194,8 +194,8 @@ class BundleProblem(ArrayRecord):
     ) -> BundleProblem:
         """The problem with some of its observations and, if they are given, of its cameras and points. `observations`
         is a mask or positions; they name no other cameras and points than those that stay. `cameras` and `points` are
-        positions, ascending; None: all. Lenses and frames keep their numbers. With points or cameras given there are no labels,
-        and no residuals but those of pixels, unless the problem is laid out (structure/residual_slots.py)."""
+        positions, ascending; None: all. Lenses and frames keep their numbers. With points or cameras given there are no
+        labels, and no residuals but those of pixels, unless the problem is laid out (structure/residual_slots.py)."""
         names = ("observations", "camera_index", "point_index", "whitening")
         arrays = {name: getattr(self, name) for name in names}
         found = replace(self, **{name: np.asarray(x)[observations] for name, x in arrays.items() if x is not None})

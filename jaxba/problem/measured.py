@@ -72,10 +72,10 @@ def with_position_priors(
 def with_rotation_priors(
     problem: BundleProblem, rotations: Any, covariance: Any, *, images: Iterable[int] | Iterable[str] | None = None
 ) -> BundleProblem:
-    """The problem with measured rotations of images, in whose frame it is. `rotations` are angle-axis from the world to
-    the camera (BAL's axes, as in `problem.cameras`), shape (n, 3), radians. `covariance` is that of the rotation in the
-    camera's frame, radians squared, shape (3, 3) for all, or (n, 3, 3). `images` are as for `with_position_priors`.
-    Raises ValueError, ProblemError: as it does."""
+    """The problem, which is in the frame of the measurements, with measured rotations of images. `rotations` are
+    angle-axis from the world to the camera (BAL's axes, as in `problem.cameras`), shape (n, 3), radians. `covariance`
+    is that of the rotation in the camera's frame, radians squared, shape (3, 3) for all, or (n, 3, 3). `images` are as
+    for `with_position_priors`. Raises ValueError, ProblemError: as that does."""
     at = _images_at(problem, images)
     measured = finite("rotations", rotations, (len(at), 3))
     whitening = AXES * _covariances(problem, "rotation", covariance, at)[1] * AXES[:, None]
