@@ -329,11 +329,10 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     bank_config = BankConfig((kind,), (args.scenes,), problems=tuple(map(str, args.problems)))
     rules = GameConfig(agent, reward="constant", tolerance=1e-4)
     options = agent.step_options(bank_config.options)
-    limits = rules.tolerance, rules.max_iterations
     key = jax.random.key(args.seed)
     (split,) = make_banks(bank_config, key, bank_config.options, rules.max_iterations, say, rules.tolerance)
     say(f"{len(split.train.initial_cost)} scenes, {len(split.held_out.initial_cost)} held out")
-    base = best_constant_action((kind,), (split.train,), agent, options, *limits)
+    base = best_constant_action((kind,), (split.train,), rules, options)
     say(f"base: action {base.action[0]:.2f}")
     actions = np.array([[action_of(agent, jnp.float32(decades))] for decades in DECADES]).clip(-1, 1)
     game = lambda bank: make_game(rules, [kind], [bank], [1], bank_config.options)

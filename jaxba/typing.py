@@ -80,13 +80,8 @@ def register_pytree(kind: type[T]) -> type[T]:
       arrays. Annotations speak of what people pass to the constructor, so types are checked there, where somebody
       checks them, and not when JAX rebuilds.
 
-    Args:
-        kind: a dataclass; fields with the metadata `{"static": True}` are part of the tree's structure. Those with
-            `{"host": True}` are not part of the tree, and None when it is rebuilt.
-
-    Returns:
-        The class itself.
-    """
+    Fields of `kind`, a dataclass, with the metadata `{"static": True}` are part of the tree's structure. Those with
+    `{"host": True}` are not part of the tree, and None when it is rebuilt. Returns the class itself."""
     host = [field.name for field in fields(kind) if field.metadata.get("host")]  # pyright: ignore
     data = [field.name for field in fields(kind) if not field.metadata]  # pyright: ignore
     static = [field.name for field in fields(kind) if field.metadata.get("static")]  # pyright: ignore

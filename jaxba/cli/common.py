@@ -43,9 +43,9 @@ def run_command(
     argv: Sequence[str] | None,
     subcommand: str = "",
 ) -> int:
-    """Parses the command line and runs `main`.
-
-    Expected errors are printed as one line to stderr, and so is a Ctrl-C or SIGTERM that `main` does not handle.
+    """Parses the command line and runs `main`. Expected errors are printed as one line to stderr, and so is a Ctrl-C or
+    SIGTERM that `main` does not handle. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or
+    143 after SIGTERM.
 
     Args:
         arguments: class of the arguments, made by `options`, in the module that has the command's name.
@@ -53,9 +53,6 @@ def run_command(
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
         subcommand: for the help, if `argv` is without it.
-
-    Returns:
-        The exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
     """
     with Interrupt() as interrupt, tolerant_streams():
         try:
@@ -96,7 +93,13 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
 
         if out_of_memory(error):
             return print_error("not enough memory")
-        _end_if_alone(error)
+        from jaxba.runtime.distributed import has_lost_process
+
+        if has_lost_process(error):  # JAX would wait for it
+            status = print_error("another process of this run has ended, and so does this one")
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
         if missing := missing_platform():
             return print_error(
                 f"JAX_PLATFORMS is {missing!r}, but JAX has no such platform on this machine: unset it, or set cpu"
@@ -104,17 +107,6 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
         if isinstance(error, OSError) and error.errno in FULL:
             return print_error(f"{error.filename or 'a file'}: {error.strerror}")
         raise
-
-
-def _end_if_alone(error: Exception) -> None:
-    """Ends this process with one line if another one of the run has ended, for which JAX would wait."""
-    from jaxba.runtime.distributed import has_lost_process
-
-    if has_lost_process(error):
-        status = print_error("another process of this run has ended, and so does this one")
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
 
 
 def counted(count: int, noun: str) -> str:

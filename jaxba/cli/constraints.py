@@ -35,19 +35,10 @@ KEYS = {
 def constrained(
     problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None, *, strict: bool = False
 ) -> BundleProblem:
-    """The problem with what the options and the file say.
-
-    Args:
-        problem: any problem.
-        constant: what `--constant` names.
-        gauge: what `--gauge` names.
-        file: YAML file of constants and priors.
-        strict: refuse positions of images that are not in the problem, instead of leaving them out with a note.
-
-    Raises:
-        UsageError: something is not in the problem; one line that names the option or the key.
-        ProblemError: as the functions of `jaxba` that do it.
-    """
+    """The problem with what the options and the file say. `constant` is what `--constant` names, `gauge` what `--gauge`
+    does, and `file` a YAML file of constants and priors. `strict` refuses positions of images that are not in the
+    problem, instead of leaving them out with a note. Raises UsageError: something is not in the problem; one line that
+    names the option or the key. Raises ProblemError: as the functions of `jaxba` that do it."""
     settings = {} if file is None else _read(file)
     if (first := "position_priors") in settings:  # the scene is aligned before anything is constant
         problem = _applied(problem, file, first, settings.pop(first), strict)
@@ -74,11 +65,8 @@ def constrained(
 
 
 def _with_known_places(problem: BundleProblem) -> np.ndarray:
-    """One camera or more of every frame, whose pose is the frame's: its place in the rig is constant.
-
-    Raises:
-        ValueError: a frame has none.
-    """
+    """One camera or more of every frame, whose pose is the frame's: its place in the rig is constant. Raises
+    ValueError: a frame has none."""
     rigs = problem.rigs
     if rigs is None or rigs.free is None:
         return np.ones(problem.num_cameras, bool)

@@ -227,7 +227,8 @@ def _evaluate(args: EvaluateArguments) -> int:
     truth = None if args.poses is None else poses_of(read_poses(args.poses), side.frames, side.calibration)
     with common.notes_printed():
         results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
-    views = [(_caption(numbers), points, poses[:, :, 3]) for numbers, poses, points in results]
+    ate = lambda row: f", ATE {row['ate_m']['rmse']:.2f} m" if "ate_m" in row else ""
+    views = [(row["name"] + ate(row), points, poses[:, :, 3]) for row, poses, points in results]
     rows = [numbers for numbers, _, _ in results]
     contents = json.dumps({"frames": side.frames, "results": rows}, allow_nan=False)
     figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
@@ -255,10 +256,6 @@ def _check_results_apart(args: EvaluateArguments) -> None:
     names += ["evaluation.json", "poses-truth.txt", "top-view.png", "top-view.svg"]
     read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
     check_apart({"--out": [folder / name for name in names]}, read)
-
-
-def _caption(numbers: dict[str, Any]) -> str:
-    return numbers["name"] + (f", ATE {numbers['ate_m']['rmse']:.2f} m" if "ate_m" in numbers else "")
 
 
 def _evaluate_table(results: list[dict[str, Any]], truth: Any) -> Any:

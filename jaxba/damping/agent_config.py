@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal
 
-from jaxba.problem.options import EMBEDDED, LensStep, Refinement, StepOptions
+from jaxba.problem.options import EMBEDDED, LensStep, Refinement, StepOptions, check_known
 
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
@@ -64,9 +64,8 @@ class AgentConfig:
     """How a step is added to focal length and distortion, `Coordinates.lens_step`."""
 
     def __post_init__(self) -> None:
-        for name, known in (("observation", Observation), ("guard", GuardMode)):
-            if getattr(self, name) not in get_args(known):
-                raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
+        check_known("observation", self.observation, Observation)
+        check_known("guard", self.guard, GuardMode)
         if not 1 <= self.history <= 20:
             raise ValueError(f"history must be 1 to 20, is {self.history}")
         if not -15 <= self.low < self.high <= 10:

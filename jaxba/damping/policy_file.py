@@ -27,16 +27,8 @@ LARGEST_FILE = 1 << 20
 
 
 def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str] | None = None) -> None:
-    """Writes a policy file atomically.
-
-    Args:
-        path: of the file; solver names accept it if it ends in `.safetensors`.
-        policy: to write.
-        metadata: where the policy comes from, for people.
-
-    Raises:
-        InputError: the file would be larger than `LARGEST_FILE`.
-    """
+    """Writes a policy file atomically; solver names accept it if it ends in `.safetensors`. `metadata` says where the
+    policy comes from, for people. Raises InputError: the file would be larger than `LARGEST_FILE`."""
     from safetensors.numpy import save
 
     tensors = {}
@@ -63,11 +55,8 @@ def _with_sorted_metadata(content: bytes) -> bytes:
 
 
 def load_policy(path: str | Path) -> LearnedPolicy:
-    """Reads a policy file.
-
-    Raises:
-        InputError: the file cannot be read, is not a policy, or its weights do not fit its configuration.
-    """
+    """Reads a policy file. Raises InputError: the file cannot be read, is not a policy, or its weights do not fit its
+    configuration."""
     tensors, metadata = _read(Path(path))
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")

@@ -62,15 +62,9 @@ CONSTANT = "constant"
 
 
 def make_policy(name: str) -> DampingPolicy:
-    """The policy called `name`.
-
-    Args:
-        name: `learned`; the path of a policy file; `FILE.py:CLASS`, for which the file is run; a key of `POLICIES`,
-            with `:FIRST_LAMBDA` for rules that have one; or `constant:LAMBDA`.
-
-    Raises:
-        InputError: no such policy, a lambda that is not a positive number, or a path that is not of a policy file.
-    """
+    """The policy called `name`: `learned`; the path of a policy file; `FILE.py:CLASS`, for which the file is run; a key
+    of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; or `constant:LAMBDA`. Raises InputError: no such
+    policy, a lambda that is not a positive number, or a path that is not of a policy file."""
     if re.fullmatch(OWN, name):
         return _own(*name.rsplit(":", 1))
     if is_learned(name):

@@ -18,7 +18,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import KINDS, LMState, StepInfo
 from jaxba.lm.step import lm_step
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import StepOptions, check_known
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
 
@@ -78,10 +78,10 @@ class GameConfig:
     """Limit of an episode's length."""
 
     def __post_init__(self) -> None:
-        if not callable(self.reward) and self.reward not in get_args(Reward):
-            raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, not {self.reward!r}")
         if callable(self.reward):
             _check_reward(self.reward)
+        else:
+            check_known("reward", self.reward, Reward)
         if not (self.max_iterations >= 1 and self.tolerance > 0 and self.scale > 0):
             raise ValueError("max_iterations, tolerance and scale must be positive")
         if not self.tolerance < 1:
@@ -285,15 +285,9 @@ def make_game(
     envs: Sequence[int],
     options: StepOptions | None = None,
 ) -> Game:
-    """A game on banks of scenes.
-
-    Args:
-        config: rules.
-        kinds: classes of the banks.
-        banks: scenes.
-        envs: environments of each class.
-        options: of the LM step; the agent's configuration overrides them (`AgentConfig.step_options`).
-    """
+    """A game on `banks` of scenes of the classes `kinds`, with the rules of `config`; `envs` are the numbers of
+    environments of each class. The agent's configuration overrides the `options` of the LM step
+    (`AgentConfig.step_options`)."""
     options = config.agent.step_options(options or StepOptions())
     for kind in kinds:
         class_layout(kind, options)  # cached on the host before anything is traced

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.damping import ConstantAction, DampingPolicy
-from jaxba.damping.agent_config import AgentConfig
+from jaxba.game.env import GameConfig
 from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, play
@@ -80,20 +80,15 @@ CONSTANT_ACTIONS = tuple(float(x) for x in np.linspace(-1.0, 1.0, 12))
 def best_constant_action(
     kinds: Sequence[SceneClass],
     banks: Sequence[Bank],
-    config: AgentConfig,
+    rules: GameConfig,
     options: StepOptions,
-    tolerance: float,
-    limit: int,
     beside: Mapping[str, tuple[DampingPolicy, StepOptions]] | None = None,
 ) -> ConstantAction:
-    """The constant action with the fewest mean iterations: what an agent must beat to have learned something.
-
-    The banks are those of training; `config` says what an action means, `beside` are policies that are played, too, so
-    that all share programs, for the rest see `evaluate`.
-    """
-    tried = {str(action): ConstantAction((action,), config) for action in CONSTANT_ACTIONS}
+    """The constant action with the fewest mean iterations: what an agent must beat to have learned something. The banks
+    are those of training; `beside` are policies that are played, too, so that all share programs."""
+    tried = {str(action): ConstantAction((action,), rules.agent) for action in CONSTANT_ACTIONS}
     steps = alike({**(beside or {}), **{name: (one, options) for name, one in tried.items()}})
-    mean = lambda name: evaluate(kinds, banks, *steps[name], tolerance, limit).mean
+    mean = lambda name: evaluate(kinds, banks, *steps[name], rules.tolerance, rules.max_iterations).mean
     return tried[min(tried, key=mean)]
 
 

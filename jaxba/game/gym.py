@@ -59,15 +59,8 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """New episodes everywhere.
-
-        Args:
-            seed: of all random numbers from now on; if None, the current sequence continues.
-            options: none.
-
-        Raises:
-            ValueError: options, which are not known.
-        """
+        """New episodes everywhere. `seed` is that of all random numbers from now on; if None, the current sequence
+        continues. Raises ValueError: options, which are not known."""
         if options:
             raise ValueError(f"reset has no options, is given {', '.join(options)}")
         super().reset(seed=seed)
@@ -77,11 +70,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
             return np.array(observation[:, : self._features]), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One iteration of every scene.
-
-        Args:
-            actions: one row per scene; numbers outside of [-1, 1] are clipped.
-        """
+        """One iteration of every scene, with a row of `actions` for each; numbers outside of [-1, 1] are clipped."""
         game = self._opened()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
@@ -112,10 +101,7 @@ class GymGame(gymnasium.Env):
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 
     def __init__(self, game: Game) -> None:
-        """
-        Args:
-            game: with a single environment.
-        """
+        """The game has a single environment."""
         if game.num_envs != 1:
             raise ValueError(f"a GymGame needs a game with one environment, this one has {game.num_envs}")
         self._one = GymVectorGame(game)
@@ -125,23 +111,15 @@ class GymGame(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A new episode.
-
-        Args:
-            seed: of all random numbers from now on; if None, the current sequence continues.
-            options: not used.
-        """
+        """A new episode. `seed` is that of all random numbers from now on; if None, the current sequence continues.
+        `options` are not used."""
         super().reset(seed=seed)
         observation, info = self._one.reset(seed=seed)
         self._running = True
         return observation[0], info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One iteration.
-
-        Args:
-            action: numbers outside of [-1, 1] are clipped.
-        """
+        """One iteration; numbers of the action outside of [-1, 1] are clipped."""
         if not self._running:
             raise gymnasium.error.ResetNeeded("call reset before step: no episode is under way")
         observation, reward, (terminated,), (truncated,), infos = self._one.step(

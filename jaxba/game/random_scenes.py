@@ -103,14 +103,8 @@ class _Rig(NamedTuple):
 @for_traces
 @functools.partial(jit, once=True, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
-    """Random scenes, the unusable ones included; see `scene_bank.solve_scenes`. Not of the family `windows`.
-
-    Args:
-        kind: shape and family.
-        key: the same key gives the same scenes.
-        count: number of scenes.
-        dtype: of all numbers.
-    """
+    """Random scenes of the shape and family of `kind`, the unusable ones included; see `scene_bank.solve_scenes`. Not
+    of the family `windows`. The same key gives the same scenes; `dtype` is that of all numbers."""
     check_x64(dtype)
     one = _paper_scene if kind.family == "paper" else _wide_scene
     scenes = lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)

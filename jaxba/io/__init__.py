@@ -33,16 +33,9 @@ __all__ = [
 def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
     """Reads a problem in any format that is known: a folder is a COLMAP model or OpenSfM's, a file is what its ending
     says (`jaxba.io.formats.FORMATS`). One with another ending is BAL, or what its first bytes say. Files may be
-    compressed.
-
-    Args:
-        path: file or folder.
-        strict: refuse what else is a `ProblemWarning`: parts that would be left out and, but for COLMAP models, what
-            looks wrong.
-
-    Raises:
-        ProblemError: it cannot be read; one line that names the file and, where there is one, the record and the field.
-    """
+    compressed. `strict` refuses what else is a `ProblemWarning`: parts that would be left out and, but for COLMAP
+    models, what looks wrong. Raises ProblemError: it cannot be read; one line that names the file and, where there is
+    one, the record and the field."""
     if is_colmap(path):
         return read_colmap(path, strict=strict)
     if not strict:
@@ -58,11 +51,7 @@ def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
 def write_problem(problem: BundleProblem, path: StrPath) -> None:
     """Writes a problem: a folder, or a name that ends in a separator, is a COLMAP model that is like no other, `.out` a
     Bundler model, `.ply` a point cloud for viewers, every other name that is not another format's a BAL file. Files may
-    be compressed.
-
-    Raises:
-        ProblemError: as `check_output` and the writers do.
-    """
+    be compressed. Raises ProblemError: as `check_output` and the writers do."""
     check_output(path)
     (write_colmap if is_folder(path) else formats.writer(path))(problem, path)
 

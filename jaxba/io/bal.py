@@ -28,15 +28,9 @@ _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translati
 def read_bal(path: StrPath) -> BundleProblem:
     """Reads a BAL file, plain or compressed by bzip2, gzip or xz (recognised by its first bytes).
 
-    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit.
-
-    Args:
-        path: the file; may be a pipe.
-
-    Raises:
-        ProblemError: the file cannot be read or is no valid problem; one line that names the file and, where there is
-            one, the line and the field.
-    """
+    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit. The path
+    may be a pipe. Raises ProblemError: the file cannot be read or is no valid problem; one line that names the file
+    and, where there is one, the line and the field."""
     problem = _read(Text(read_text(path), display_name(path)))
     note_origin(path, np.asarray(problem.observations))
     return problem
@@ -47,16 +41,9 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
 
     The file is replaced whole or not at all. BAL cannot store covariances, weights, shared intrinsics or what is
     constant: these are **not** written, and the problem reads back without whitening and with free intrinsics of its
-    own for every camera.
-
-    Args:
-        problem: of NumPy or JAX arrays; float32 is written as the float64 of the same value.
-        path: the file, replaced if it exists.
-
-    Raises:
-        ProblemError: the problem is not valid, for example not finite, has lenses that are not BAL's, or the file
-            cannot be written.
-    """
+    own for every camera. Arrays are of NumPy or JAX; float32 is written as the float64 of the same value. Raises
+    ProblemError: the problem is not valid, for example not finite, has lenses that are not BAL's, or the file cannot be
+    written."""
     valid = bal_only(problem, path)
     index = (valid.camera_index.tolist(), valid.point_index.tolist(), valid.observations.tolist())
     with open_output(path) as file:

@@ -31,15 +31,9 @@ def read_bundler(path: StrPath) -> BundleProblem:
     """Reads a Bundler model of version 0.3, plain or compressed by bzip2, gzip or xz.
 
     Cameras that Bundler could not register (f = 0) are dropped and the others renumbered. Points are kept even when
-    fewer than two cameras see them. Colours and key-point numbers are ignored.
-
-    Args:
-        path: the file; may be a pipe.
-
-    Raises:
-        ProblemError: the file cannot be read or is no valid model, or a point is seen by an unregistered camera; one
-            line that names the file and, where there is one, the line and the field.
-    """
+    fewer than two cameras see them. Colours and key-point numbers are ignored. The path may be a pipe. Raises
+    ProblemError: the file cannot be read or is no valid model, or a point is seen by an unregistered camera; one line
+    that names the file and, where there is one, the line and the field."""
     text = Text(read_text(path), display_name(path))
     header = text.next_line()
     if header != HEADER:
@@ -54,16 +48,9 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
     """Writes a Bundler model of version 0.3; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
     The file is replaced whole or not at all. Observations stand in the order of their points, rotations are matrices,
-    and points are grey. Covariances, weights and shared intrinsics cannot be stored, as in BAL.
-
-    Args:
-        problem: of NumPy or JAX arrays.
-        path: the file, replaced if it exists.
-
-    Raises:
-        ProblemError: the problem is not valid, a camera that sees points has focal length 0, which stands for cameras
-            that are not registered, lenses are not BAL's, or the file cannot be written.
-    """
+    and points are grey. Covariances, weights and shared intrinsics cannot be stored, as in BAL. Arrays are of NumPy or
+    JAX. Raises ProblemError: the problem is not valid, a camera that sees points has focal length 0, which stands for
+    cameras that are not registered, lenses are not BAL's, or the file cannot be written."""
     valid = bal_only(problem, path)
     cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)
     lost = np.flatnonzero((cameras[:, 6] == 0) & (np.bincount(camera_index, minlength=len(cameras)) > 0))

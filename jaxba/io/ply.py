@@ -21,15 +21,8 @@ def write_ply(problem: BundleProblem, path: StrPath) -> None:
     """Writes the points (grey), then the camera centres (green), as coloured vertices in scene units.
 
     Vertices are binary, little-endian, and hold the float64 numbers exactly. The file is replaced whole or not at all;
-    it is compressed if the name ends in `.bz2`, `.gz` or `.xz`.
-
-    Args:
-        problem: of NumPy or JAX arrays.
-        path: the file, replaced if it exists.
-
-    Raises:
-        ProblemError: a point or camera centre is not finite, or the file cannot be written.
-    """
+    it is compressed if the name ends in `.bz2`, `.gz` or `.xz`. Arrays are of NumPy or JAX. Raises ProblemError: a
+    point or camera centre is not finite, or the file cannot be written."""
     points = np.asarray(problem.points, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         centres = camera_centers(problem.cameras)

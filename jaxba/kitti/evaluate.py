@@ -46,13 +46,8 @@ def evaluate(
     lengths: tuple[float, ...] = trajectory_errors.DEVKIT_LENGTHS,
 ) -> list[tuple[dict[str, Any], Float[np.ndarray, "cameras 3 4"], Float[np.ndarray, "points 3"]]]:
     """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
-
-    Returns:
-        Of each: name, sizes, reprojection error and, with a truth, `score`; its aligned poses and points.
-
-    Raises:
-        ProblemError: a file cannot be read, has other cameras than the sidecar file, or cannot be aligned.
-    """
+    Returns of each: name, sizes, reprojection error and, with a truth, `score`; its aligned poses and points. Raises
+    ProblemError: a file cannot be read, has other cameras than the sidecar file, or cannot be aligned."""
     results = []
     for path in paths:
         problem = read_problem(path)

@@ -65,15 +65,9 @@ def _lower_cholesky_jvp(matrix: tuple[Array], change: tuple[Array]) -> tuple[Arr
 
 
 def factor_and_solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solves `A x = b` for a symmetric positive definite matrix after Jacobi scaling.
-
-    Args:
-        matrix: only its lower triangle is read.
-        right: `b`, or several as columns.
-
-    Returns:
-        The solution; non-finite if the matrix is not positive definite.
-    """
+    """Solves `A x = b` for a symmetric positive definite matrix, of which only the lower triangle is read, after Jacobi
+    scaling; `right` is `b`, or several as columns. The solution is non-finite if the matrix is not positive
+    definite."""
     scale = lax.rsqrt(jnp.diagonal(matrix))
     scaled = matrix * scale[:, None] * scale
     rows = scale if right.ndim == 1 else scale[:, None]
@@ -90,12 +84,9 @@ def _lapack_solve(matrix: Array, right: Array) -> Array:
 
 
 def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Panels:
-    """Left-looking Cholesky factorisation: each panel first subtracts the products of all earlier ones.
-
-    Args:
-        matrix: symmetric with a diagonal near one; only its lower triangle is read.
-        least: fewest columns of a panel; `PANEL` if None.
-    """
+    """Left-looking Cholesky factorisation: each panel first subtracts the products of all earlier ones. The matrix is
+    symmetric with a diagonal near one; only its lower triangle is read. `least` is the fewest columns of a panel;
+    `PANEL` if None."""
     n = matrix.shape[0]
     width = max(least or PANEL, -(-n // MAX_PANELS))
     inverses, belows = [], []

@@ -35,7 +35,9 @@ def conjugate_gradients(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Array, "..."], Int[Array, ""]]:
-    """Solves `A x = b` from `x = 0` for a symmetric positive definite operator.
+    """Solves `A x = b` from `x = 0` for a symmetric positive definite operator. Returns the iterate and the number of
+    iterations. Negative curvature stops with the last iterate. A non-finite number makes the result non-finite, and the
+    caller rejects the step.
 
     Args:
         apply: `A`.
@@ -45,10 +47,6 @@ def conjugate_gradients(
             i. Source: Ceres conjugate_gradients_solver, after Nash and Sofer 1990. Zero switches the test off.
         tolerance: stop when `|r| <= tolerance |b|`.
         max_iterations: upper bound.
-
-    Returns:
-        The iterate and the number of iterations. Negative curvature stops with the last iterate. A non-finite number
-        makes the result non-finite, and the caller rejects the step.
     """
     bound = tolerance * tolerance * jnp.sum(right * right)
 

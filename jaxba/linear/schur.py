@@ -188,11 +188,11 @@ def apply_reduced(system: DampedSystem, x: Float[Array, "cameras width"]) -> Flo
     return jnp.einsum("cab,cb->ca", system.cameras.blocks, x) - eliminated
 
 
-def lift_to_cameras(system: DampedSystem) -> Float[Array, "cameras width"]:
-    """`E (C + D_p)^-1 g_p = sum Y h` of every camera, for the solved gradients h of the points."""
-    layout, linear, points = system[:3]
-    solved = take(jnp.stack(points.solved), layout.slot_point)
-    over, under = (sum(points.projected[k][i] * solved[i] for i in range(3)) for k in range(2))
+def lift_to_cameras(
+    layout: Layout, linear: Linearization, projected: list[list[Array]], solved: list[Array] | Array
+) -> Float[Array, "cameras width"]:
+    """`E (C + D_p)^-1 g_p = sum Y h` of every camera, for the solved gradients h of the points at their slots."""
+    over, under = (sum(row[i] * solved[i] for i in range(3)) for row in projected)
     rows = as_rows([a * over + b * under for a, b in zip(*linear.camera_jacobian, strict=True)])
     return sum_over_devices(layout, tree_sum(rows, layout.camera_levels))
 

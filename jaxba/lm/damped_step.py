@@ -43,7 +43,8 @@ def solve_step(
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
 ) -> Step:
-    """Solves `(H + D) d = -g` for cameras and points.
+    """Solves `(H + D) d = -g` for cameras and points. The step is non-finite if a factorisation failed; the caller
+    rejects such a step.
 
     Args:
         layout: the problem's observations; must list pairs if the options form the reduced camera system.
@@ -53,9 +54,6 @@ def solve_step(
         damping: lambda, dimensionless for diagonal scaling.
         options: linear solver or method, scaling and coordinates.
         iteration: number of the iteration; selects the random clusters of methods that use them.
-
-    Returns:
-        The step. It is non-finite if a factorisation failed; the caller rejects such a step.
     """
     forcing = (options.truncated or options.conjugate_gradients).forcing
     system = DampedSystem.of(layout, linear, cameras, points, damping, options)

@@ -39,12 +39,8 @@ class StepMethod(MethodTraits, ABC):
 
     @abstractmethod
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
-        """The camera step, and the point step if the method computes it too.
-
-        Args:
-            system: the damped system.
-            options: static options of the step.
-        """
+        """The camera step of the damped system, and the point step if the method computes it too; the options are
+        static."""
 
 
 @dataclass(frozen=True)

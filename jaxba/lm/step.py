@@ -49,14 +49,9 @@ class Proposal(NamedTuple):
 
 @for_traces
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
-    """The problem's parameters in layout order, with their cost.
-
-    Args:
-        layout: made from the same problem.
-        problem: start of the optimisation.
-        options: the loss and the method.
-        dtype: floating point type of the solve; that of the problem's arrays if None.
-    """
+    """The parameters of a problem, the start of the optimisation, in the order of a layout that was made from it, with
+    their cost, for the loss and the method of the options. `dtype` is the floating point type of the solve; that of the
+    problem's arrays if None."""
     check_x64(problem.cameras.dtype if dtype is None else dtype)
     if layout.unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + layout.unknowns.size:
         raise ValueError("a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it")
@@ -86,7 +81,9 @@ def lm_step(
     min_gain: float | Float[Array, ""] = 0.0,
     iteration: int | Int[Array, ""] = 0,
 ) -> tuple[LMState, StepInfo]:
-    """One iteration: one linear solve with the given lambda, accepted or rejected.
+    """One iteration: one linear solve with the given lambda, accepted or rejected. Returns the next state (unchanged
+    after a rejection) and the record of the iteration. Raises ValueError: the method does not support the problem
+    (`lm.method.PLAIN_ONLY`); or the state is float64, and 64 bits are not enabled in JAX.
 
     Without refinement it is differentiable by cameras, points, observations and lambda (the accept decision is a
     constant): forwards with every linear solver; backwards with a factorisation in full precision and a layout without
@@ -99,13 +96,6 @@ def lm_step(
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
         iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
-
-    Returns:
-        The next state (unchanged after a rejection) and the record of the iteration.
-
-    Raises:
-        ValueError: the method does not support the problem (`lm.method.PLAIN_ONLY`); or the state is float64, and 64
-            bits are not enabled in JAX.
     """
     check_x64(state.cost.dtype)
     proposal = propose(layout, state, damping, options, iteration)

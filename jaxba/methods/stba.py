@@ -28,7 +28,7 @@ from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.linear.formed import reduced_blocks
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced, damping_diagonal
+from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced, damping_diagonal, lift_to_cameras
 from jaxba.lm.method import MethodStep, StepMethod
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import StepOptions, check_count
@@ -36,7 +36,7 @@ from jaxba.runtime import loops
 from jaxba.runtime.fusion import computed_after
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
-from jaxba.structure.segment_sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
+from jaxba.structure.segment_sums import point_sum, take, take_each, take_rows, tree_sum
 
 MIN_CONSENSUS_DAMPING = 1.0
 """Smallest lambda for which the gradients of replicas are made to agree. Source: the authors' code (radius at most
@@ -112,14 +112,8 @@ def consensus_gradient(
         g_k <- D_k (sum_j g_j) / (sum_j D_j)
 
     These are the nearest such gradients in the metric of `D^-1`: the closed form of the published projection
-    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica.
-
-    Args:
-        layout: the problem's observations.
-        partition: the partition of this iteration.
-        diagonal: D, diagonal of the damped block of each replica.
-        gradient: g of each replica.
-    """
+    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica. `diagonal` is D, the diagonal of
+    the damped block of each replica in the partition of this iteration, and `gradient` is its g."""
     # Sums over the replicas of a point run over its slots, with weights that sum to one for each replica.
     count = tree_sum(jnp.asarray(layout.slot_mask, gradient.dtype)[:, None], partition.levels)[:, 0]
     weight = jnp.where(count > 0, 1 / jnp.maximum(count, 1), 0)
@@ -135,11 +129,7 @@ def split_right_hand_side(
     layout: Layout, linear: Linearization, system: CameraSystem, split: SplitSystem
 ) -> Float[Array, "cameras width"]:
     """Right-hand side of the split system, `-sum J_c^T (r - Q h)`."""
-    projected, solved = split
-    inner = [sum(projected[k][i] * solved[i] for i in range(3)) for k in range(2)]
-    first, second = linear.camera_jacobian
-    rows = as_rows([a * inner[0] + b * inner[1] for a, b in zip(first, second, strict=True)])
-    return tree_sum(rows, layout.camera_levels) - system.gradient
+    return lift_to_cameras(layout, linear, *split) - system.gradient
 
 
 def solve_clusters(

@@ -103,17 +103,9 @@ def poses(
 def project(
     frame: Frames, points: Float[Array, "3 ..."] | list[Array], mask: Bool[AnyArray, "..."] = EVERYWHERE
 ) -> Projection:
-    """Projects one point through one camera per column.
-
-    Args:
-        frame: camera of each column.
-        points: point of each column, scene units.
-        mask: where false, the projection and everything derived from it is exactly zero.
-
-    Returns:
-        Pixels and intermediate values, in lists. A point on the camera plane gives non-finite pixels; a point behind
-        the camera is projected like any other, as in BAL.
-    """
+    """Projects one point (scene units) through one camera per column. Where the mask is false, the projection and
+    everything derived from it is exactly zero. Returns pixels and intermediate values, in lists. A point on the camera
+    plane gives non-finite pixels; a point behind the camera is projected like any other, as in BAL."""
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in frame.rotation]
     local = [rotated[k] + frame.translation[k] for k in range(3)]
     turned = ()
@@ -135,15 +127,9 @@ def derivatives(
     frame: Frames, projection: Projection, columns: Sequence[int] | None = None
 ) -> tuple[list[list[Array]], list[list[Array]]]:
     """Jacobians of `project` by the camera (rotation on the manifold, translation, lens), [2][width] of [n], and by the
-    point, [2][3] of [n]: columns, each of which is one fused expression.
-
-    Args:
-        frame: camera of each column.
-        projection: what `project` returned for it.
-        columns: numbers of the lens, and then of extrinsics, to differentiate by; None: all.
-
-        dz/dt = dz/dP      dz/dw = -dz/dP [R X]x      dz/dX = dz/dP R
-    """
+    point, [2][3] of [n]: columns, each of which is one fused expression. `projection` is what `project` returned for
+    these cameras. `columns` are the numbers of the lens, and then of extrinsics, to differentiate by; None: all. By the
+    chain rule `dz/dt = dz/dP`, `dz/dw = -dz/dP [R X]x` and `dz/dX = dz/dP R`."""
     rows, by_lens = frame.model.derivatives(list(frame.lens), frame.which, projection)
     by_number = [functools.partial(by_lens, k) for k in range(len(frame.lens))]
     for place, turned in zip(reversed(frame.places), reversed(projection.turned), strict=True):

@@ -48,18 +48,9 @@ Terms = Callable[..., list[Array]]
 def view_terms(
     layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], terms: Terms, *slots: Array
 ) -> list[Float[Array, " slots"]]:
-    """Evaluates a function of an observation, its camera and its point for every slot, in one loop.
-
-    Args:
-        layout: the problem's observations.
-        frames: camera of every slot, materialised (`linearize.slot_frames`).
-        points: current points.
-        terms: the function.
-        slots: its further arguments, vectors over slots.
-
-    Returns:
-        A vector over slots for each term.
-    """
+    """Evaluates a function of an observation, its camera and its point for every slot, in one loop. Returns a vector
+    over slots for each term. `frames` are the cameras of every slot, materialised (`linearize.slot_frames`), `points`
+    are the current ones, and `slots` are further arguments of the function, vectors over slots."""
     return compute_in_one_loop(terms, _views(layout, frames, points), *slots)
 
 

@@ -40,6 +40,9 @@ def with_residual(
     """The problem with rows of a residual of one's own (`jaxba.residual`).
 
     The cost has `1/2 rho(|r|^2)` for each row, with r as the function returns it. Points are eliminated as for pixels.
+    Raises ValueError, ProblemError: an index is out of range, a block is missing or malformed, unknowns of a row belong
+    to different cameras without saying so (`_2`), or the function cannot be computed, is not finite at the start,
+    depends on a parameter in no row, or has other derivatives than differences; one line.
 
     Args:
         problem: any problem.
@@ -47,11 +50,6 @@ def with_residual(
         loss: robust loss of the squared norm of a row; None: squared.
         unknowns: start of each new block by its name, shape (n, numbers): a row for each camera, or fewer, which
             several cameras have in common. `Solution.problem.residuals` has their values after a solve.
-
-    Raises:
-        ValueError, ProblemError: an index is out of range, a block is missing or malformed, unknowns of a row belong to
-            different cameras without saying so (`_2`), or the function cannot be computed, is not finite at the start,
-            depends on a parameter in no row, or has other derivatives than differences; one line.
     """
     if not isinstance(rows, Rows):
         raise ValueError(f"rows must be those of a residual, called with indices and data, not {shown(rows)}")

@@ -72,11 +72,8 @@ class Traced:
         self.size = _size(self._closed)
 
     def __call__(self, *operands: Numbers) -> Numbers:
-        """Its numbers for all rows, whose vectors are of one shape.
-
-        Raises:
-            NotImplementedError: the function does something for which there is no rule here.
-        """
+        """Its numbers for all rows, whose vectors are of one shape. Raises NotImplementedError: the function does
+        something for which there is no rule here."""
         (found,) = _evaluated(self._closed, operands)
         return found
 

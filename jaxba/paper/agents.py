@@ -125,20 +125,9 @@ def own_folder(agent: Agent, folder: Path) -> Path:
 
 
 def train(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> bool:
-    """Trains an agent if the folder does not have its policies yet.
-
-    Args:
-        config: configuration of the reproduction run.
-        agent: the agent.
-        folder: folder of the reproduction run.
-        report: called with a line of text when something starts.
-
-    Returns:
-        Whether it was trained by this call.
-
-    Raises:
-        InputError: the training cannot start or continue; the message is one line.
-    """
+    """Trains an agent if the folder of the reproduction run does not have its policies yet; `report` is called with a
+    line of text when something starts. Returns whether it was trained by this call. Raises InputError: the training
+    cannot start or continue; the message is one line."""
     own = own_folder(agent, folder)
     files = [own / POLICY.format(seed + 1) for seed in range(config.agents.seeds)]
     if all(file.is_file() for file in files):
@@ -161,9 +150,8 @@ def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Calla
     if not path.is_file():
         report(f"{agent.name}: best constant action")
         work, played = game_of(config, agent, folder, report)
-        banks, rules = task.first_scenes(played.banks, work.held_out), played.config
-        limits = rules.tolerance, rules.max_iterations
-        found = best_constant_action(played.kinds, banks, rules.agent, played.options, *limits)
+        banks = task.first_scenes(played.banks, work.held_out)
+        found = best_constant_action(played.kinds, banks, played.config, played.options)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_policy(path, always(found.action[0], found.config))
     return path

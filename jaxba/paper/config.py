@@ -155,14 +155,8 @@ PAPER_STATE = 5
 
 
 def load(name: str) -> PaperConfig:
-    """The configuration of a preset or a file.
-
-    Args:
-        name: a preset, or the path of a YAML file: anything with a slash or an ending.
-
-    Raises:
-        SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line.
-    """
+    """The configuration of a preset, or of a YAML file by its path: anything with a slash or an ending. Raises
+    SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line."""
     data = configurations.read("paper", name)
     try:
         return settings.read(PaperConfig, data)

@@ -218,14 +218,8 @@ class Runner:
 
     def solve(self, sources: Iterable[Source], methods: Sequence[Method], limit: int = LIMIT, repeats: int = 0) -> None:
         """Solves problems with methods, except for those whose results the folder has. A problem that cannot be read is
-        reported and skipped.
-
-        Args:
-            sources: problems.
-            methods: methods.
-            limit: limit of linear solves.
-            repeats: repeats of each solve; as in the configuration if 0.
-        """
+        reported and skipped. `limit` is that of linear solves, and `repeats` the repeats of each solve; as in the
+        configuration if 0."""
         for source in sources:
             for method in methods:
                 for seed in method.numbers:

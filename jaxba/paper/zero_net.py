@@ -103,17 +103,9 @@ def slope_of_next_cost(
 
 
 def train(config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array) -> tuple[ZeroNet, np.ndarray]:
-    """Trains a network on the first bank of a game.
-
-    Args:
-        config: sizes of the network and of the training.
-        game: provides the scenes; its rewards are not used.
-        agent: length of the history and range of lambda.
-        key: random key.
-
-    Returns:
-        The network, and for each update the mean of log10(next cost / current cost).
-    """
+    """Trains a network on the scenes of the first bank of a game, whose rewards are not used. `config` has the sizes of
+    the network and of the training, `agent` the length of the history and the range of lambda. Returns the network, and
+    for each update the mean of log10(next cost / current cost)."""
     start, play = jax.random.split(key)
     net = initial_network(config, agent, start)
     layers, means = _train(config, game, net, play)

@@ -101,16 +101,12 @@ class TwoSidedReprojection(pyceres.CostFunction):
                 return True
             by_p = f * (distortion * np.eye(2) + 2 * (k1 + 2 * k2 * r) * np.outer(p, p))
             by_local = by_p @ np.column_stack([np.eye(2), -p]) / local[2]
-        rotation = np.eye(3) + 2 * (w * _cross(v) + _cross(v) @ _cross(v))
-        by_vector = -2 * (w * _cross(point) + _cross(turned) + _cross(v) @ _cross(point))
+        of_v, of_point, of_turned = geometry.cross_matrices(np.stack([v, point, turned]))
+        rotation = np.eye(3) + 2 * (w * of_v + of_v @ of_v)
+        by_vector = -2 * (w * of_point + of_turned + of_v @ of_point)
         by_pose = by_local @ np.column_stack([by_vector, 2 * turned, np.eye(3)])
         by_lens = np.column_stack([distortion * p, np.eye(2), f * r * p, f * r * r * p])
         for target, value in zip(jacobians, (by_local @ rotation, by_pose, by_lens), strict=True):
             if target is not None:
                 target[:] = value.ravel()
         return True
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    """The cross-product matrix `[v]x`."""
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

@@ -106,7 +106,10 @@ class BundleProblem(ArrayRecord):
         constants: Constants | None = None,
         rigs: Rigs | None = None,
     ) -> BundleProblem:
-        """Checks the arrays and returns a problem of float64 and int32 NumPy arrays.
+        """Checks the arrays and returns a problem of float64 and int32 NumPy arrays. Raises ProblemError: shapes
+        differ, an index is out of range, a number is not finite, there is an empty array of observations, a covariance
+        is not positive definite, cameras of one lens differ in their intrinsics, or a part of the problem does not fit
+        the others.
 
         Args:
             cameras: shape (cameras, 9), or (cameras, 6 + numbers of the largest camera model).
@@ -122,11 +125,6 @@ class BundleProblem(ArrayRecord):
             lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
             constants: optional; poses and points that are not optimised.
             rigs: optional; cameras that move together.
-
-        Raises:
-            ProblemError: shapes differ, an index is out of range, a number is not finite, there
-                is an empty array of observations, a covariance is not positive definite, cameras of one lens
-                differ in their intrinsics, or a part of the problem does not fit the others.
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
@@ -194,14 +192,10 @@ class BundleProblem(ArrayRecord):
         cameras: Int[np.ndarray, " _"] | None = None,
         points: Int[np.ndarray, " _"] | None = None,
     ) -> BundleProblem:
-        """The problem with some of its observations and, if they are given, of its cameras and points.
-
-        Args:
-            observations: a mask or positions; they name no other cameras and points than those that stay.
-            cameras: positions, ascending; None: all. Lenses and frames keep their numbers.
-            points: positions, ascending; None: all. With these or cameras there are no labels, and no residuals but
-                those of pixels, unless the problem is laid out (structure/residual_slots.py).
-        """
+        """The problem with some of its observations and, if they are given, of its cameras and points. `observations`
+        is a mask or positions; they name no other cameras and points than those that stay. `cameras` and `points` are
+        positions, ascending; None: all. Lenses and frames keep their numbers. With points or cameras given there are no
+        labels, and no residuals but those of pixels, unless the problem is laid out (structure/residual_slots.py)."""
         names = ("observations", "camera_index", "point_index", "whitening")
         arrays = {name: getattr(self, name) for name in names}
         found = replace(self, **{name: np.asarray(x)[observations] for name, x in arrays.items() if x is not None})

@@ -74,19 +74,11 @@ def _registered(name: str) -> CameraModel:
 
 
 def register_camera_model(name: str, parameters: str, project: Callable[..., Pixel]) -> CameraModel:
-    """Adds a camera model to `CAMERA_MODELS`.
-
-    Args:
-        name: of the model.
-        parameters: names of the numbers of a lens, separated by spaces. Focal lengths are called `f`, or `fx` and `fy`;
-            the principal point `cx` and `cy`; everything else counts as distortion.
-        project: from a sequence of these numbers, and x, y and z in the camera's frame (x right, y down, z forwards,
-            scene units), to the two coordinates of a pixel. Written with operators and functions of
-            `x.__array_namespace__()`, it serves NumPy and JAX.
-
-    Raises:
-        ValueError: another model has the name.
-    """
+    """Adds a camera model to `CAMERA_MODELS`. `parameters` are the names of the numbers of a lens, separated by spaces:
+    focal lengths are called `f`, or `fx` and `fy`; the principal point `cx` and `cy`; everything else counts as
+    distortion. `project` goes from a sequence of these numbers, and x, y and z in the camera's frame (x right, y down,
+    z forwards, scene units), to the two coordinates of a pixel. Written with operators and functions of
+    `x.__array_namespace__()`, it serves NumPy and JAX. Raises ValueError: another model has the name."""
     model = CameraModel(name, tuple(parameters.split()), project)
     if CAMERA_MODELS.get(name, model) != model:
         raise ValueError(f"there is a camera model {name} already")

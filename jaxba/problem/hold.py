@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from jaxba.problem.checks import shown
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.options import check_known
 from jaxba.problem.preprocess import observed
 from jaxba.problem.residuals import Residuals
 
@@ -42,7 +43,7 @@ def hold(
     numbers: Iterable[str] = (),
     extrinsics: Which = (),
 ) -> BundleProblem:
-    """The problem with more of it constant.
+    """The problem with more of it constant. Raises ValueError: no such image, lens, point or number; one line.
 
     Args:
         problem: any problem.
@@ -53,9 +54,6 @@ def hold(
         numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
             camera model such as `k2`.
         extrinsics: lenses whose place in their rig is constant; of no effect without rigs.
-
-    Raises:
-        ValueError: no such image, lens, point or number; one line.
     """
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
     constants.poses[_mask(problem, poses, problem.num_cameras, "image")] = True
@@ -94,13 +92,8 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     `BundleAdjustmentGauge`.
 
     In a scene far from the origin (`preprocess.FAR`) the number of a translation is that of the scene shifted to it.
-
-    Raises:
-        ValueError: no such gauge.
-        ProblemError: fewer than two cameras, or three points, are observed.
-    """
-    if gauge not in get_args(Gauge):
-        raise ValueError(f"gauge must be one of {', '.join(get_args(Gauge))}, not {gauge!r}")
+    Raises ValueError: no such gauge. Raises ProblemError: fewer than two cameras, or three points, are observed."""
+    check_known("gauge", gauge, Gauge)
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)

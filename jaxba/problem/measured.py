@@ -36,7 +36,9 @@ def with_position_priors(
     loss: Loss | None = None,
     align: bool = True,
 ) -> BundleProblem:
-    """The problem with measured positions of images.
+    """The problem with measured positions of images. Raises ValueError: shapes, or no such image; one line. Raises
+    ProblemError: a covariance is not positive definite; or an alignment would move what is constant or has priors, or
+    the positions are latitude and longitude, or mirrored.
 
     Args:
         problem: any problem.
@@ -49,11 +51,6 @@ def with_position_priors(
         align: whether the scene is first moved, turned and scaled to the measured positions, robustly, as COLMAP does.
             What they do not determine, such as the rotation about a line, stays as it is, with a `ProblemWarning`.
             Without it the scene must be in their frame already.
-
-    Raises:
-        ValueError: shapes, or no such image; one line.
-        ProblemError: a covariance is not positive definite; or an alignment would move what is constant or has priors,
-            or the positions are latitude and longitude, or mirrored.
     """
     at = _images_at(problem, images)
     measured = finite("positions", positions, (len(at), 3))
@@ -75,17 +72,10 @@ def with_position_priors(
 def with_rotation_priors(
     problem: BundleProblem, rotations: Any, covariance: Any, *, images: Iterable[int] | Iterable[str] | None = None
 ) -> BundleProblem:
-    """The problem with measured rotations of images.
-
-    Args:
-        problem: any problem, in the frame of the measurements.
-        rotations: angle-axis from the world to the camera (BAL's axes, as in `problem.cameras`), shape (n, 3), radians.
-        covariance: of the rotation in the camera's frame, radians squared, shape (3, 3) for all, or (n, 3, 3).
-        images: as for `with_position_priors`.
-
-    Raises:
-        ValueError, ProblemError: as `with_position_priors`.
-    """
+    """The problem, which is in the frame of the measurements, with measured rotations of images. `rotations` are
+    angle-axis from the world to the camera (BAL's axes, as in `problem.cameras`), shape (n, 3), radians. `covariance`
+    is that of the rotation in the camera's frame, radians squared, shape (3, 3) for all, or (n, 3, 3). `images` are as
+    for `with_position_priors`. Raises ValueError, ProblemError: as that does."""
     at = _images_at(problem, images)
     measured = finite("rotations", rotations, (len(at), 3))
     whitening = AXES * _covariances(problem, "rotation", covariance, at)[1] * AXES[:, None]
@@ -94,16 +84,9 @@ def with_rotation_priors(
 
 
 def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> BundleProblem:
-    """The problem with its lenses' numbers believed as they are, to a standard deviation.
-
-    Args:
-        problem: any problem; the numbers it has are the expected ones.
-        numbers: standard deviation by the name of a number, such as `k1`, or of a group (`focal`, `principal_point`,
-            `distortion`), in the units of the number.
-
-    Raises:
-        ValueError: no such number, or a standard deviation that is not positive; one line.
-    """
+    """The problem with its lenses' numbers believed as they are, to a standard deviation. `numbers` has the standard
+    deviation by the name of a number, such as `k1`, or of a group (`focal`, `principal_point`, `distortion`), in the
+    units of the number. Raises ValueError: no such number, or a standard deviation that is not positive; one line."""
     lenses = every_lens(problem)
     used, first = np.unique(lenses.index, return_index=True)
     mean, weight = np.asarray(problem.cameras)[first, POSE_SIZE:], np.zeros(np.asarray(lenses.free).shape)

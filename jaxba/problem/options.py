@@ -51,7 +51,7 @@ class ConjugateGradients:
     others takes with the two-level preconditioner: 6 to 20 on real problems."""
 
     def __post_init__(self) -> None:
-        _check_known("preconditioner", self.preconditioner, Preconditioner)
+        check_known("preconditioner", self.preconditioner, Preconditioner)
         check_count("max_iterations", self.max_iterations, 1)
         check_count("budget", self.budget, 1)
         for name in ("forcing", "tolerance"):
@@ -84,7 +84,7 @@ class Refinement:
     def __post_init__(self) -> None:
         for name, least in (("points", 0), ("camera_rounds", 0), ("pattern_moves", 0), ("trials", 1)):
             check_count(name, getattr(self, name), least)
-        _check_known("starts", self.starts, PointStarts)
+        check_known("starts", self.starts, PointStarts)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         for name, known in (("scaling", Scaling), ("rotation", Rotation), ("lens_step", LensStep)):
-            _check_known(name, getattr(self, name), known)
+            check_known(name, getattr(self, name), known)
 
 
 class MethodTraits:
@@ -156,8 +156,8 @@ class StepOptions:
     is then the preconditioner of a few conjugate gradient iterations in full precision."""
 
     def __post_init__(self) -> None:
-        _check_known("linear_solver", self.linear_solver, LinearSolver)
-        _check_known("intrinsics", self.intrinsics, Intrinsics)
+        check_known("linear_solver", self.linear_solver, LinearSolver)
+        check_known("intrinsics", self.intrinsics, Intrinsics)
 
     @property
     def solver_name(self) -> str:
@@ -195,7 +195,8 @@ class StepOptions:
         return not exact and self.conjugate_gradients.preconditioner == "two-level"
 
 
-def _check_known(name: str, value: str, kind: Any) -> None:
+def check_known(name: str, value: Any, kind: Any) -> None:
+    """Raises a ValueError unless a value is one of a `Literal`."""
     if value not in get_args(kind):
         raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {value!r}")
 

@@ -29,17 +29,9 @@ def normalize(problem: BundleProblem, size: float = SIZE) -> BundleProblem:
     """The same problem in coordinates in which the points are centred and have a given spread.
 
     A similarity moves the marginal median of the points to the origin and scales their median L1 distance from it to
-    `size`. All residuals, and so the cost, are unchanged.
-
-    Args:
-        problem: the problem to normalise.
-        size: new median L1 distance, scene units.
-
-    Raises:
-        ProblemError: `size` is not positive, there are no points, or half of them coincide.
-
-    Source: Ceres `BALProblem::Normalize` (its median is the upper one of an even count).
-    """
+    `size`, scene units. All residuals, and so the cost, are unchanged. Raises ProblemError: `size` is not positive,
+    there are no points, or half of them coincide. Source: Ceres `BALProblem::Normalize` (its median is the upper one of
+    an even count)."""
     if not (np.isfinite(size) and size > 0):
         raise ProblemError(f"the size of a normalised scene must be positive, not {size}")
     points = np.asarray(problem.points, dtype=np.float64)
@@ -104,7 +96,8 @@ def perturb(
     translation_sigma: float = 0.0,
     point_sigma: float = 0.0,
 ) -> BundleProblem:
-    """Adds Gaussian noise to the start of a problem; the observations stay.
+    """Adds Gaussian noise to the start of a problem; the observations stay. Raises ProblemError: a sigma is negative or
+    not finite. Source: Ceres `BALProblem::Perturb`.
 
     As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held fixed, then translation
     noise is added to `t = -R c`. rootba adds it to the centre c, which has the same distribution, since the noise is
@@ -116,11 +109,6 @@ def perturb(
         rotation_sigma: radians, on each component of the angle-axis vector.
         translation_sigma: scene units, on each component.
         point_sigma: scene units, on each coordinate.
-
-    Raises:
-        ProblemError: a sigma is negative or not finite.
-
-    Source: Ceres `BALProblem::Perturb`.
     """
     for name, sigma in (("rotation", rotation_sigma), ("translation", translation_sigma), ("point", point_sigma)):
         if not (np.isfinite(sigma) and sigma >= 0):
@@ -143,17 +131,8 @@ def drop_invalid(problem: BundleProblem, min_depth: float = MIN_DEPTH) -> Bundle
     """Removes observations of points nearer than `min_depth` (scene units) in front of their camera or behind it.
 
     Points with fewer than `MIN_TRACK` remaining observations are removed, and the others are renumbered in order.
-    Cameras keep their indices, even without observations.
-
-    Args:
-        problem: the problem to filter.
-        min_depth: smallest depth, scene units.
-
-    Raises:
-        ProblemError: nothing would be left.
-
-    Source: rootba `BalProblem::filter_obs`.
-    """
+    Cameras keep their indices, even without observations. Raises ProblemError: nothing would be left. Source: rootba
+    `BalProblem::filter_obs`."""
     keep = depths(problem) >= min_depth
     point_index = np.asarray(problem.point_index)
     tracks = np.bincount(point_index[keep], minlength=problem.num_points)

@@ -60,17 +60,11 @@ class Residual:
         return _imported, (self.function.__module__, self.function.__qualname__, self.source)
 
     def __call__(self, **columns: Any) -> Rows:
-        """Rows of the residual.
-
-        Args:
-            columns: for each unknown an index or a vector of them: a camera for `pose`, a point for `point`, a lens (a
-                camera in a problem without shared lenses) for `lens`, a row for a block. For each keyword of data an
-                array with a row for each residual, or one value for all, with a first axis of one if its own first axis
-                is as long as there are residuals.
-
-        Raises:
-            ValueError: a name is missing or unknown, lengths differ, or something is no index or no number; one line.
-        """
+        """Rows of the residual. Each unknown gets an index or a vector of them: a camera for `pose`, a point for
+        `point`, a lens (a camera in a problem without shared lenses) for `lens`, a row for a block. Each keyword of
+        data gets an array with a row for each residual, or one value for all, with a first axis of one if its own first
+        axis is as long as there are residuals. Raises ValueError: a name is missing or unknown, lengths differ, or
+        something is no index or no number; one line."""
         names = (*self.unknowns, *self.data)
         for what, found in (("has no", columns.keys() - set(names)), ("needs", set(names) - columns.keys())):
             if found:
@@ -95,15 +89,9 @@ def _imported(module: str, name: str, source: str) -> Residual:
 
 
 def residual(function: Callable[..., Any]) -> Residual:
-    """A decorator: a function as a residual.
-
-    Args:
-        function: positional parameters are unknowns, keyword-only ones data (`jaxba.with_residual`). It is
-            differentiated by JAX, for one row at a time, and returns a number or a vector, whitened.
-
-    Raises:
-        ValueError: it has no unknown, or parameters of another kind; one line.
-    """
+    """A decorator: a function as a residual. Positional parameters are unknowns, keyword-only ones data
+    (`jaxba.with_residual`). The function is differentiated by JAX, for one row at a time, and returns a number or a
+    vector, whitened. Raises ValueError: it has no unknown, or parameters of another kind; one line."""
     if not inspect.isfunction(function) or function.__name__ == PIXELS:
         raise ValueError(f"a residual is made of a function that is not named {PIXELS}, not of {shown(function)}")
     kinds = inspect.Parameter

@@ -62,11 +62,8 @@ def _named_camera(problem: BundleProblem, rows: Rows, ending: str) -> Int[np.nda
 
 
 def owners_of(problem: BundleProblem, rows: Rows, groups: list[Int[np.ndarray, " cameras"]]) -> Owners:
-    """Cameras and points that stand for rows, for the `block_groups` of the problem.
-
-    Raises:
-        ProblemError: unknowns of a row are not of one camera, or a row has more than can be laid out.
-    """
+    """Cameras and points that stand for rows, for the `block_groups` of the problem. Raises ProblemError: unknowns of a
+    row are not of one camera, or a row has more than can be laid out."""
     names, cameras, blocks = rows.residual.unknowns, [], problem.residuals.names
     of_cameras = (name for name in names if name.removesuffix(SECOND) != POINT)
     for ending in dict.fromkeys(SECOND * name.endswith(SECOND) for name in of_cameras):

@@ -85,15 +85,9 @@ def value(
     blocks: Sequence[Float[Array, "cameras _"]],
     data: Sequence[Array],
 ) -> Float[Array, " size"]:
-    """The function of a residual at one row.
-
-    Args:
-        rows: the function, and the frame that it sees.
-        cameras: of the row.
-        points: of the row; anything if it has none.
-        blocks: for each unknown of the function its block, of each camera.
-        data: for each keyword of the function its value.
-    """
+    """The function of a residual at one row; `rows` has the function, and the frame that it sees. Cameras and points
+    are those of the row, points anything if it has none. `blocks` has for each unknown of the function its block, of
+    each camera, and `data` for each keyword of the function its value."""
     dtype = cameras.translation.dtype
     scale, turn, shift, axes = (jnp.asarray(x, dtype) for x in (rows.scale, rows.rotation, rows.translation, AXES))
     arguments: list[Any] = []

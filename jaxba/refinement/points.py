@@ -107,7 +107,9 @@ def refine_points(
     previous: PreviousPoints | None = None,
     min_decrease: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """Improves every point by up to `iterations` damped Gauss-Newton steps of its own.
+    """Improves every point by up to `iterations` damped Gauss-Newton steps of its own. Returns points, and the cost of
+    the observations of each (pixels^2). It is never larger than at the start, which for reset points is the previous
+    position.
 
     Args:
         layout: the problem's observations.
@@ -121,10 +123,6 @@ def refine_points(
             a camera and was in front of it, or more than `MAX_DISTANCE_RATIO` times as far away.
         min_decrease: stop after an iteration that lowers the total cost by at most this (pixels^2) and by at most
             `SMALL_DECREASE` of the cost that is left.
-
-    Returns:
-        Points, and the cost of the observations of each (pixels^2). It is never larger than at the start, which for
-        reset points is the previous position.
     """
     one_pass = point_passes(layout, frames)
     before, alone = previous or PreviousPoints.unknown(layout, points), points_alone(layout)

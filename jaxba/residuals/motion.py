@@ -63,7 +63,8 @@ def imu(
 def preintegrated(
     times: Any, angular_rates: Any, accelerations: Any, moments: Any, *, noise: Any, bias: Any = (0.0,) * 6
 ) -> dict[str, Float[np.ndarray, "..."]]:
-    """The data of `imu` from samples of an IMU: a row for each pair of successive images.
+    """The data of `imu` from samples of an IMU: a row for each pair of successive images. Raises ValueError: shapes,
+    noise that is not positive, or times that do not ascend or enclose the images; one line.
 
     Args:
         times: of the samples, ascending, shape (n,), seconds.
@@ -73,9 +74,6 @@ def preintegrated(
         noise: as in Kalibr's files, shape (4,): densities of white noise of the gyroscope (rad/s/sqrt(Hz)) and of the
             accelerometer (m/s^2/sqrt(Hz)), and of the random walks of their biases (the same per second).
         bias: of the gyroscope and the accelerometer, about which the result is linear, shape (6,).
-
-    Raises:
-        ValueError: shapes, noise that is not positive, or times that do not ascend or enclose the images; one line.
     """
     t, at = finite("times", times, (np.size(times),)), finite("moments", moments, (np.size(moments),))
     bias, deviation = finite("bias", bias, (6,)), np.repeat(finite("noise", noise, (4,)), 3)

@@ -40,7 +40,8 @@ def solve_and_retriangulate(
     """`solve` and, if it converged, `retriangulate`, alternately.
 
     It ends when a retriangulation lowers the cost by at most `ftol` times the cost, or after `MAX_ROUNDS` of them.
-    Every solve starts with the policy's initial lambda.
+    Every solve starts with the policy's initial lambda. Returns one solution for all solves. Retriangulation is not an
+    iteration; its time is in `total_s` and `compile_s`. Raises ValueError, ProblemError: as `solve`.
 
     Args:
         problem: start of the optimisation.
@@ -52,12 +53,6 @@ def solve_and_retriangulate(
             is too small (`Retriangulation.pays`).
         watch: as for `solve`; iterations and seconds are counted over all solves.
         verbose: as for `solve`.
-
-    Returns:
-        One solution for all solves. Retriangulation is not an iteration; its time is in `total_s` and `compile_s`.
-
-    Raises:
-        ValueError, ProblemError: as `solve`.
     """
     options = checked_options(options)
     callback, compiling = shown(callback, verbose)

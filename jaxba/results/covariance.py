@@ -118,16 +118,10 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     """The covariance of the numbers of a problem at its minimum.
 
     Memory grows with the square of the unknown numbers of cameras, and time with their cube. What is not determined by
-    what is observed, as a point that is seen once, has NaN, and a ProblemWarning names it.
-
-    Args:
-        problem: a solved problem, with the constants, gauge, priors and other residuals that were used.
-        loss: robust loss of the solve; None: squared.
-
-    Raises:
-        ProblemError: the position, orientation or scale of the scene is free; `with_gauge`, constants or priors fix
-            them.
-    """
+    what is observed, as a point that is seen once, has NaN, and a ProblemWarning names it. The problem is a solved one,
+    with the constants, gauge, priors and other residuals that were used; `loss` is the robust loss of the solve,
+    squared if None. Raises ProblemError: the position, orientation or scale of the scene is free; `with_gauge`,
+    constants or priors fix them."""
     check_problem(problem)
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
     given, (counted, offset, problem) = problem, placed(problem, facing_away(problem))

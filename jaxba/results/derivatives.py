@@ -49,6 +49,7 @@ from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY, set_up
 from jaxba.solver.solve import solve
 from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import take
 from jaxba.typing import AnyArray, differ, outline, same
 
 DAMPING = 1e-10
@@ -104,15 +105,10 @@ def differentiable_solve(
     lenses, angles, ratios of distances, and aligned cameras, has no other derivative; the rest of what a solve finds
     also depends on its way there, which differences see and derivatives do not.
 
-    Args:
-        problem: says everything that the inputs do not: who sees what, lenses, constants, priors, rigs.
-        policy: as for `solve`.
-        options: as for `solve`. Tolerances should be tight: the theorem holds at a minimum.
-
-    Returns:
-        A function; its derivatives raise a ProblemError if conjugate gradients do not solve with the Hessian, as where
-        more than gauge and depths of points is not determined.
-    """
+    The problem says everything that the inputs do not: who sees what, lenses, constants, priors, rigs. `policy` and
+    `options` are as for `solve`. Tolerances should be tight: the theorem holds at a minimum. Derivatives of the
+    returned function raise a ProblemError if conjugate gradients do not solve with the Hessian, as where more than
+    gauge and depths of points is not determined."""
     check_problem(problem)
     options = checked_options(options)
 
@@ -313,7 +309,9 @@ def _gauss_newton(
     def inverse(right: tuple[Array, Array]) -> tuple[Array, Array]:
         solved = [-x for x in system.points.factor.forward(list(right[1]))]
         own = system._replace(points=system.points._replace(solved=solved))
-        own = own._replace(cameras=own.cameras._replace(right=right[0] + lift_to_cameras(own)))
+        at_slots = take(jnp.stack(solved), layout.slot_point)
+        lifted = lift_to_cameras(layout, linear, own.points.projected, at_slots)
+        own = own._replace(cameras=own.cameras._replace(right=right[0] + lifted))
         step, _ = solve_reduced(own, options)
         return step, jnp.stack(back_substitute(own, step))
 

@@ -88,18 +88,11 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Every point starts from the midpoint of the rays of its pixels and at several distances from the first camera that
     sees it (`START_DISTANCES`), and takes `POINT_ITERATIONS` Gauss-Newton steps from each start. It moves to the best
     result, if the cost falls enough (`MIN_RELATIVE_GAIN`, `MIN_GAIN`) and it is behind no more cameras than before.
-    Constant points stay. Images that face away from their points are left out, as by `solve`.
+    Constant points stay. Images that face away from their points are left out, as by `solve`. Best at the end of a
+    solve: at a bad start points would be fitted to wrong cameras.
 
-    Args:
-        problem: best at the end of a solve: at a bad start points would be fitted to wrong cameras.
-        loss: robust loss of the squared whitened residual.
-
-    Returns:
-        The problem with the moved points, in float64.
-
-    Raises:
-        ProblemError: the cost is not finite.
-    """
+    `loss` is the robust loss of the squared whitened residual. Returns the problem with the moved points, in float64.
+    Raises ProblemError: the cost is not finite."""
     check_problem(problem)
     return retriangulate_without(facing_away(problem), problem, loss)
 

@@ -44,13 +44,8 @@ def compute_unfused(function: Callable[..., Result], *operands: Array, index: In
     A kernel that writes its result into a larger array, as the last one in the body of a loop does, runs on one core;
     and what a gather reads is fused into it and computed anew for every row. On a CPU a branch that is always taken
     avoids both: branches are computations of their own, and cost a few microseconds. On a GPU, where a branch makes the
-    host wait, nothing is done.
-
-    Args:
-        function: of arrays, to one or several.
-        operands: its arguments.
-        index: any index array that is an argument of the whole program: nowhere negative, which XLA does not know.
-    """
+    host wait, nothing is done. The function is of arrays, to one or several. `index` is any index array that is an
+    argument of the whole program: nowhere negative, which XLA does not know."""
 
     def never(*operands: Array) -> Result:
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function, *operands))
@@ -79,12 +74,10 @@ def compute_in_one_loop(function: Callable[..., list[Array]], *operands: Any) ->
     whose second half is zero: LLVM unrolls that axis, drops the zero half, and vectorises the rest, as it does for no
     reduction over three and more.
 
-    Args:
-        function: of arrays whose last axis is the loop's, elementwise in it: it indexes only the axes before, and
-            returns vectors, at least one. A gather inside keeps LLVM from vectorising.
-        operands: arrays, or pytrees of them, whose last axis is the loop's. A gathered operand, or one that several
-            vectors are made of, is better stored before (`fusion_barrier`).
-    """
+    The function is of arrays whose last axis is the loop's, elementwise in it: it indexes only the axes before, and
+    returns vectors, at least one. A gather inside keeps LLVM from vectorising. Operands are arrays, or pytrees of them,
+    whose last axis is the loop's. A gathered one, or one that several vectors are made of, is better stored before
+    (`fusion_barrier`)."""
 
     def one_loop(*operands: Any) -> list[Array]:
         twice = lambda x: jnp.broadcast_to(jnp.expand_dims(x, -2), (*x.shape[:-1], 2, x.shape[-1]))

@@ -46,13 +46,8 @@ def run_if(needed: Any, function: Callable[..., Carry], arguments: tuple[Any, ..
 
     Under `vmap` both branches of `jax.lax.cond` would be computed; this is, once one of the batch needs it. What does
     not change in a loop XLA computes before it, needed or not: so the arguments pass a barrier that is in the loop.
-
-    Args:
-        needed: whether, a boolean or 0 or 1.
-        function: of arrays or pytrees of arrays.
-        arguments: its arguments. Closed-over values may be evaluated even if `needed` is false.
-        otherwise: of the type of its result.
-    """
+    `needed` is a boolean or 0 or 1, and the function is of arrays or pytrees of arrays. Values that it closes over may
+    be evaluated even if `needed` is false. `otherwise` is of the type of its result."""
 
     def body(k: Array, _: Carry) -> Carry:
         inside, _ = lax.optimization_barrier((arguments, k))

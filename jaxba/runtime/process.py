@@ -91,14 +91,8 @@ def release_programs(share: float | None = None) -> bool:
     XLA maps a few pages for every kernel of a program, some thousands for a solver and a problem. At `vm.max_map_count`
     (65,530 unless set) the next compilation ends the process with a segmentation fault, which a benchmark of fifteen
     problems and a dozen solvers reaches. A dropped program is read from the compilation cache, or compiled again, when
-    it is needed again.
-
-    Args:
-        share: of the limit, from which on programs are dropped; `MAPPINGS_SHARE` if None.
-
-    Returns:
-        Whether they were dropped; false where the system does not report mappings.
-    """
+    it is needed again. `share` is that of the limit, from which on programs are dropped; `MAPPINGS_SHARE` if None.
+    Returns whether they were dropped; false where the system does not report mappings."""
     global _mappings_left
     share = MAPPINGS_SHARE if share is None else share
     try:

@@ -201,11 +201,7 @@ cameras and 10 points, all visible, of the paper that this project reproduces.""
 
 
 def scene_like(name: str) -> SceneConfig:
-    """The configuration of a name in `LIKE`.
-
-    Raises:
-        ProblemError: no such name; the message lists the known ones.
-    """
+    """The configuration of a name in `LIKE`. Raises ProblemError: no such name; the message lists the known ones."""
     if name not in LIKE:
         raise ProblemError(f"no scene is called {name!r}; known are {', '.join(LIKE)}")
     return LIKE[name]

@@ -32,7 +32,9 @@ def solve_loop(
     max_iterations: int,
     limit: Int[AnyArray, ""] | None = None,
 ) -> tuple[Carry, StepInfo]:
-    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
+    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes. Returns the
+    final carry, and the record: arrays of length `max_iterations`, zero after the last iteration. Raises ValueError:
+    the state is float64, and 64 bits are not enabled in JAX.
 
     Args:
         layout: the problem's observations.
@@ -42,12 +44,6 @@ def solve_loop(
         options: static options of the step.
         max_iterations: length of the record, static.
         limit: a lower limit of iterations, not static.
-
-    Returns:
-        Final carry, and the record: arrays of length `max_iterations`, zero after the last iteration.
-
-    Raises:
-        ValueError: the state is float64, and 64 bits are not enabled in JAX.
     """
     check_x64(state.cost.dtype)
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)

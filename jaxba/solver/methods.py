@@ -56,14 +56,8 @@ METHODS: Mapping[str, StepMethod] = _Methods()
 
 
 def make_method(name: str) -> StepMethod:
-    """The method called `name`.
-
-    Args:
-        name: a key of `METHODS`; methods with clusters of cameras accept their largest size, as in `stba:16`.
-
-    Raises:
-        InputError: no such method, or an invalid size.
-    """
+    """The method called `name`, a key of `METHODS`; methods with clusters of cameras accept their largest size, as in
+    `stba:16`. Raises InputError: no such method, or an invalid size."""
     if name == DEFAULT_METHOD:
         return PLAIN
     base, colon, size = name.partition(":")

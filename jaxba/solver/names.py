@@ -65,11 +65,7 @@ class SolverName:
         return f"{method}{self.policy}{refinement}{dtype}"
 
     def build(self) -> tuple[DampingPolicy, SolveOptions]:
-        """The policy, and the options of the solve.
-
-        Raises:
-            InputError: as `make_policy`, `make_method`.
-        """
+        """The policy, and the options of the solve. Raises InputError: as `make_policy`, `make_method`."""
         policy = make_policy(self.policy)
         step = trained_step(policy)
         if self.refine_points is not None:
@@ -133,11 +129,7 @@ def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, Sol
 
 
 def parse_solver(name: str) -> SolverName:
-    """Parses a solver name.
-
-    Raises:
-        InputError: an unknown method, mode, type or policy, or a malformed name.
-    """
+    """Parses a solver name. Raises InputError: an unknown method, mode, type or policy, or a malformed name."""
     if name.strip().partition(":")[0] in PEERS:
         return _parse_peer(name.strip())
     # the path of a file may contain `+` and `@`

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import trained_step
@@ -18,6 +18,7 @@ from jaxba.problem.options import (
     Refinement,
     StepOptions,
     check_count,
+    check_known,
 )
 from jaxba.runtime.compilation import Compilation
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
@@ -111,8 +112,7 @@ class SolveOptions:
         elif not isinstance(self.method, StepMethod):
             raise ValueError(f"method must be an entry of jaxba.METHODS or its name, is {self.method!r}")
         for name, known in _CHOICES.items():
-            if getattr(self, name) not in get_args(known):
-                raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
+            check_known(name, getattr(self, name), known)
         check_count("max_iterations", self.max_iterations, 0)
         if self.within:
             object.__setattr__(self, "tolerances", self.tolerances._replace(within=self.within))
@@ -123,11 +123,8 @@ class SolveOptions:
                 raise ValueError(f"{name} must not be negative, is {value}")
 
     def step_options(self, policy: DampingPolicy) -> StepOptions:
-        """The step options for a policy. The linear solver `auto` is replaced by `explicit`, to be chosen later.
-
-        Raises:
-            ValueError: options that exclude each other, or an unknown method.
-        """
+        """The step options for a policy. The linear solver `auto` is replaced by `explicit`, to be chosen later. Raises
+        ValueError: options that exclude each other, or an unknown method."""
         trained = trained_step(policy)
         method = make_method(self.method) if isinstance(self.method, str) else self.method
         step = method.options(

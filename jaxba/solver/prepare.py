@@ -116,16 +116,8 @@ def prepare(
     """Everything that a solve does before its first iteration, for callers that jit, vmap or time the loop themselves.
 
     Arrays are float64 unless the options say float32. To use them, enable 64 bits in JAX with
-    `jax.config.update("jax_enable_x64", True)` or `jax.enable_x64(True)`.
-
-    Args:
-        problem: start of the optimisation.
-        policy: as for `solve`.
-        options: as for `solve`.
-
-    Raises:
-        ValueError, ProblemError: as `solve`.
-    """
+    `jax.config.update("jax_enable_x64", True)` or `jax.enable_x64(True)`. The problem is the start of the optimisation;
+    `policy` and `options` are as for `solve`. Raises ValueError, ProblemError: as `solve`."""
     setup = set_up(problem, policy, options)
     if setup.shards is not None:
         raise ProblemError("prepare is for one device; jaxba.solve divides a problem among several")

@@ -42,19 +42,10 @@ class Band:
 def camera_order(
     rows: Int[np.ndarray, " blocks"], columns: Int[np.ndarray, " blocks"], cameras: int
 ) -> tuple[Int[np.ndarray, " cameras"], int]:
-    """The given or the reverse Cuthill-McKee ordering, whichever has the smaller bandwidth.
-
-    Args:
-        rows: camera of the rows of each non-zero block.
-        columns: camera of its columns; one triangle is enough.
-        cameras: number of cameras.
-
-    Returns:
-        The rank (position) of each camera, and the bandwidth: the largest difference in rank of two cameras that see a
-        point in common.
-
-    Source: Cuthill and McKee 1969; reversed by George 1971.
-    """
+    """The given or the reverse Cuthill-McKee ordering, whichever has the smaller bandwidth. `rows` and `columns` are
+    the cameras of the rows and of the columns of each non-zero block; one triangle is enough. Returns the rank
+    (position) of each camera, and the bandwidth: the largest difference in rank of two cameras that see a point in
+    common. Source: Cuthill and McKee 1969; reversed by George 1971."""
     given = np.arange(cameras)
     width = int(np.abs(rows - columns).max(initial=0))
     linked = np.zeros((cameras, cameras), bool)

@@ -148,7 +148,13 @@ def build_layout(
     grid: bool = True,
     agreement: Agreement = ALONE,
 ) -> Layout:
-    """Assigns a problem's observations to slots and builds the index arrays of their sums.
+    """Assigns a problem's observations to slots and builds the index arrays of their sums. Raises ValueError: arguments
+    that exclude each other, or a problem larger than the capacity.
+
+    Returns a pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the
+    problem. With one they follow from the capacity, from whether there is whitening, from whether the system is one
+    dense product (`is_dense`), and from whether usual bounds hold: on tracks and blocks (`prefix_levels`), on
+    half-filled chunks (`Capacity.usual_observations`), and on how often cameras see points twice (`room_for`).
 
     Args:
         problem: a checked problem, `in_frames` if it has rigs, `laid_out` if it has other residuals than those of
@@ -160,15 +166,6 @@ def build_layout(
         grid: whether a factored system may be formed as one dense matrix product instead of from pairs, where that is
             cheaper (structure/density.py).
         agreement: with the layouts of the other shards of a problem (solver/sharded.py).
-
-    Returns:
-        A pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the problem.
-        With one they follow from the capacity, from whether there is whitening, from whether the system is one dense
-        product (`is_dense`), and from whether usual bounds hold: on tracks and blocks (`prefix_levels`), on half-filled
-        chunks (`Capacity.usual_observations`), and on how often cameras see points twice (`room_for`).
-
-    Raises:
-        ValueError: arguments that exclude each other, or a problem larger than the capacity.
     """
     factor, pairs = options.factors_reduced_system, options.forms_reduced_system
     if capacity is not None and not factor:

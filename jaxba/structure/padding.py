@@ -83,16 +83,9 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
 
     Cameras are rounded up to `CAMERAS`, slots to eight sizes an octave. Points and pairs get a fixed multiple of the
     slots, or the next larger one if that is not enough: rounding each on its own would give more programs.
-
-    Args:
-        problem: the problem to pad.
-        observations: its sorted observations, if they are known already.
-
-    Returns:
-        The capacity; None for problems with lenses (problem/intrinsics.py), constants, rigs or other residuals than
-        those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS`, or with more observations or points than
-        `MAX_OBSERVATIONS`.
-    """
+    `observations` are the sorted ones of the problem, if they are known already. Returns None for problems with lenses
+    (problem/intrinsics.py), constants, rigs or other residuals than those of pixels, with more than `MAX_CAMERAS` or
+    `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`."""
     general = problem.lenses is not None or problem.constants is not None
     general = general or problem.rigs is not None or bool(problem.residuals)
     observations = observations or ObservationOrder.of(problem)

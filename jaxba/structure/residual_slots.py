@@ -58,10 +58,7 @@ class ResidualSlots(ArrayRecord):
 def laid_out(problem: BundleProblem) -> BundleProblem:
     """A problem `in_frames` with its blocks after the numbers of cameras, and observations that stand for its residuals
     after those of pixels, with new points and cameras where they need them. Without residuals it is the problem itself.
-
-    Raises:
-        ProblemError: see `owners_of`.
-    """
+    Raises ProblemError: see `owners_of`."""
     residuals = problem.residuals
     if not residuals:
         return problem
@@ -140,15 +137,9 @@ def residual_slots(
     points: Int[np.ndarray, " points"],
     agreement: Agreement,
 ) -> tuple[ResidualSlots, ...]:
-    """Rows of a problem that is `laid_out`.
-
-    Args:
-        problem: the problem.
-        slot: of each of the sorted observations.
-        sorted_observations: their positions in the problem.
-        points: the point at each position in layout order.
-        agreement: with the other shards of the problem.
-    """
+    """Rows of a problem that is `laid_out`. `slot` is that of each of the sorted observations, `sorted_observations`
+    are their positions in the problem, `points` the points at each position in layout order, and `agreement` is that
+    with the other shards of the problem."""
     residuals = problem.residuals
     if not residuals:
         return ()

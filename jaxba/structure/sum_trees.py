@@ -48,6 +48,9 @@ def sum_tree(
     agreement: Agreement = ALONE,
 ) -> tuple[np.ndarray, ...]:
     """The summation tree of `items`, with chunks of `width` on the first level and of `TREE_WIDTH` on the others.
+    Returns index arrays [chunks, width], one per level; those of level l + 1 index the sums of level l. Every level but
+    the last ends with a row of padding; the last one has exactly one row per target, in order. Raises ValueError: the
+    items exceed the room.
 
     Args:
         items: row indices, those of target 0 first, then those of target 1, ...
@@ -57,13 +60,6 @@ def sum_tree(
         room: bounds from which the shapes follow, together with the number of targets and the width; None: the shapes
             follow from the data.
         agreement: with the trees of other shards, which have the same shapes.
-
-    Returns:
-        Index arrays [chunks, width], one per level; those of level l + 1 index the sums of level l. Every level but the
-        last ends with a row of padding; the last one has exactly one row per target, in order.
-
-    Raises:
-        ValueError: the items exceed the room.
     """
     levels = []
     room = room or Room.of(counts)
@@ -105,7 +101,7 @@ def prefix_levels(
 
     The targets that have an r-th item are a prefix of the targets. A level holds ranks r, r + 1, ..., 2 r - 1, a row
     each, for the prefix of rank r. The lengths of prefixes follow from the room, by the first of `PREFIX_SHARES` that
-    suffices.
+    suffices. Raises ValueError: the items exceed the room.
 
     Args:
         items: row indices, those of target 0 first, then those of target 1, ...
@@ -113,9 +109,6 @@ def prefix_levels(
         empty: index of a row of zeros, for padding.
         room: bounds from which the shapes follow, together with the number of targets.
         first: first rank that is listed. Rank 0 is listed for all targets.
-
-    Raises:
-        ValueError: the items exceed the room.
     """
     if len(items) > room.items or counts.max(initial=0) > room.most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")

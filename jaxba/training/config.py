@@ -141,15 +141,9 @@ def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
-    """The configuration of a preset or a file.
-
-    Args:
-        name: a preset, or the path of a YAML file: anything with a slash or an ending.
-        overrides: `key.key=value` each, the value in YAML; they override the file.
-
-    Raises:
-        SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line.
-    """
+    """The configuration of a preset, or of a YAML file by its path: anything with a slash or an ending. `overrides` are
+    `key.key=value` each, the value in YAML; they override the file. Raises SettingsError: no such file or base, not
+    YAML, an unknown key or an impossible value; one line."""
     data = configurations.read("train", name)
     for override in overrides:
         if not isinstance(override, str):

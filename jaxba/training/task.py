@@ -189,9 +189,8 @@ def _baseline_runs(
     names = list(baselines or BASELINES)
     policies = baseline_policies(config, game.options, [name for name in names if name != CONSTANT])
     if CONSTANT in names:
-        rules, banks = config.game, first_scenes(game.banks, held_out)
-        limits = rules.tolerance, rules.max_iterations
-        found = best_constant_action(config.bank.classes, banks, rules.agent, game.options, *limits, policies)
+        banks = first_scenes(game.banks, held_out)
+        found = best_constant_action(config.bank.classes, banks, config.game, game.options, policies)
         policies[CONSTANT] = found, game.options
     runs = play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
     _write_runs(path, runs)

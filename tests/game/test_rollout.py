@@ -15,6 +15,7 @@ from tiny_game import AGENT, KIND, grid, problem_of, tiny_bank
 from jaxba import StepOptions, make_method, make_policy
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
+from jaxba.game.env import GameConfig
 from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
 from jaxba.game.groups import GROUP, step_groups
 from jaxba.game.one_of import alike
@@ -213,7 +214,7 @@ def test_a_paired_ratio_is_the_geometric_mean_with_the_interval_of_its_standard_
 @pytest.mark.slow
 def test_the_best_constant_action_has_the_fewest_iterations():
     bank = tiny_bank()
-    best = best_constant_action([KIND], [bank], AGENT, StepOptions(), 1e-3, LIMIT)
+    best = best_constant_action([KIND], [bank], GameConfig(AGENT, max_iterations=LIMIT), StepOptions())
     means = [
         evaluate([KIND], [bank], ConstantAction((action,), AGENT), StepOptions(), 1e-3, LIMIT).mean
         for action in CONSTANT_ACTIONS

@@ -63,16 +63,10 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
     Images of one frame of a rig move together; where cameras are in their rigs is constant.
 
     What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
-
-    Args:
-        folder: of the model.
-        strict: refuse a model of which a part would be left out.
-        refine_principal_point: whether principal points are optimised, too. COLMAP's default is no.
-
-    Raises:
-        ProblemError: no model, one whose structure is damaged, a rig that does not say where a camera is, nothing is
-            observed, or a part would be left out and `strict`; one line that names the file, and the record by its id.
-    """
+    `strict` refuses a model of which a part would be left out. `refine_principal_point` optimises principal points,
+    too; COLMAP's default is no. Raises ProblemError: no model, one whose structure is damaged, a rig that does not say
+    where a camera is, nothing is observed, or a part would be left out and `strict`; one line that names the file, and
+    the record by its id."""
     model = read_model(folder)
     assembled = assemble(model, refine_principal_point=refine_principal_point)
     report(assembled.notes, strict=strict)

@@ -30,7 +30,12 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     """Writes a problem as a COLMAP model.
 
     All files are first written to a hidden folder; then each replaces the old one whole. They are binary, or text where
-    the other model is text and the folder holds no binary one.
+    the other model is text and the folder holds no binary one. The folder is made if it does not exist, and may be that
+    of the other model.
+
+    With another model, `like`, the problem is as `read_colmap` made it from that one, with optimised cameras and
+    points. Poses, points and intrinsics of what is in the problem are replaced, and point errors; all else is written
+    as it was read, also what `read_colmap` left out.
 
     Without another model, image, camera and point ids count from 1, and images are called `image0001.jpg` and so on.
     Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and constant.
@@ -38,16 +43,8 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     which are relative to the upper left corner. Other lenses keep their pixels, models and numbers. Weights, and what
     is constant, cannot be stored.
 
-    Args:
-        problem: as `read_colmap` made it from the other model, with optimised cameras and points; any, without one.
-        folder: where to write; made if it does not exist, and may be the folder of the other model.
-        like: the other model. Poses, points and intrinsics of what is in the problem are replaced, and point errors;
-            all else is written as it was read, also what `read_colmap` left out.
-
-    Raises:
-        ProblemError: the problem is not one of that model or cannot be stored, images of one camera have different
-            intrinsics, or the folder cannot be written.
-    """
+    Raises ProblemError: the problem is not one of that model or cannot be stored, images of one camera have different
+    intrinsics, or the folder cannot be written."""
     if like is None:
         write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
