@@ -186,7 +186,7 @@ def judge(runs: dict[str, dict[str, Any]], solver: str) -> Iterator[str]:
             run = found[solver]
             if not run["converged"]:
                 continue
-            step = jaxba.StepInfo(**{name: np.array(x) for name, x in run["history"].items()})
+            step = jaxba.StepInfo._make(np.array(run["history"][name]) for name in jaxba.StepInfo._fields)
             stops = np.flatnonzero(distance_to_end(step, np.where) <= within)
             last = int(stops[0]) if len(stops) else len(step.cost) - 1
             covered.append(step.cost[last] <= run["final"] * (1 + within))

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.records import StepInfo
 from jaxba.refinement.acceptance import COST_ROUNDING
-from jaxba.typing import AnyArray
 
 DAMPING_LIMIT = 1e32
 """A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
@@ -106,7 +105,7 @@ class Tolerances(NamedTuple):
     off."""
 
 
-def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Float[AnyArray, "..."]:
+def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:
     """How far a cost is above the one at which the solve would end, relative to it: an estimate that is seldom too
     small, infinite after a rejected or shortened step.
 

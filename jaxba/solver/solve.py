@@ -93,7 +93,7 @@ class Solution(ArrayRecord):
         the last accepted step was shortened."""
         kept = np.flatnonzero(self.history.accepted)[-1:]
         with np.errstate(all="ignore"):
-            found = distance_to_end(StepInfo(*(np.asarray(x)[kept] for x in self.history)), np.where)
+            found = distance_to_end(StepInfo._make(np.asarray(x)[kept] for x in self.history), np.where)
         return float(found[0]) if len(kept) else math.inf
 
     @property
