@@ -203,7 +203,7 @@ def test_a_second_call_of_the_command_traces_no_step_and_writes_the_same_file(tm
     ends = []
     for turn in range(2):
         output = tmp_path / f"{turn}.txt"
-        command = [sys.executable, "-c", COUNTING, str(problem), "--output", str(output)]
+        command = [sys.executable, "-c", COUNTING, str(problem), "--output", str(output), "--compilation", "quick"]
         environment = {**os.environ, "JAXBA_CACHE": str(folder)}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         printed = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
