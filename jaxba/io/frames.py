@@ -35,11 +35,6 @@ class Calibration:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of camera 0 in the frame of this camera, metres: `K^-1` times the last column of `P`."""
 
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """The matrix K."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
-
     def rays(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Directions `(X / Z, Y / Z)` of pixels; x to the right, y down, z forward."""
         return (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
@@ -54,9 +49,6 @@ class Sidecar:
 
     calibration: Calibration
     """Calibration of the images."""
-
-    contents: Mapping[str, Any]
-    """The whole file."""
 
 
 def poses_of(poses: Poses, numbers: tuple[int, ...], calibration: Calibration) -> Float[np.ndarray, "frames 3 4"]:
@@ -89,4 +81,4 @@ def read_sidecar(path: StrPath) -> Sidecar:
         raise ProblemError(f"{display_name(side)}: cannot be read: {reason(error)}; jaxba-kitti writes it") from None
     except (ValueError, KeyError, TypeError):
         raise ProblemError(f"{display_name(side)}: is not a sidecar file of jaxba-kitti") from None
-    return Sidecar(frames, calibration, contents)
+    return Sidecar(frames, calibration)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxba.peers.colmap import (
     LENS_SIZE,
@@ -90,10 +90,6 @@ class ColmapProblem:
     def set_parameters_of(self, problem: BundleProblem) -> None:
         """Sets the parameters to those of a problem of the same shape, in place."""
         self.restore(_parameters(problem))
-
-    def residuals(self) -> Float[np.ndarray, " residuals"]:
-        """The residuals that Ceres evaluates at the current parameters, pixels."""
-        return np.array(self.ceres.evaluate_residuals())
 
     def bundle(self) -> BundleProblem:
         """The problem at the current parameters. Cameras without observations are unchanged."""

@@ -64,7 +64,7 @@ def test_a_byte_order_mark_is_no_trouble(folder):
 def test_rays_of_pixels_are_the_inverse_of_the_matrix():
     calibration = Calibration(700.0, 650.0, 600.0, 180.0)
     place = np.array([0.3, -0.2, 2.0])
-    pixel = calibration.matrix @ place
+    pixel = np.array([[700.0, 0.0, 600.0], [0.0, 650.0, 180.0], [0.0, 0.0, 1.0]]) @ place
     np.testing.assert_allclose(calibration.rays(pixel[None, :2] / pixel[2])[0], place[:2] / place[2])
 
 

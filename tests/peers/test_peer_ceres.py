@@ -105,7 +105,9 @@ def test_residuals_are_those_of_bal_also_behind_the_camera(make):
     ours = -geometry.residuals(problem) * (1, -1)
     found = np.array([cost.evaluate(*blocks(colmap, k))[0].ravel() for k, cost in enumerate(colmap._costs)])
     np.testing.assert_allclose(found, ours, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(0.5 * np.sum(colmap.residuals() ** 2), geometry.cost(problem), rtol=1e-12)
+    np.testing.assert_allclose(
+        0.5 * np.sum(np.square(colmap.ceres.evaluate_residuals())), geometry.cost(problem), rtol=1e-12
+    )
 
 
 def blocks(colmap: ColmapProblem, observation: int) -> tuple:
@@ -506,7 +508,9 @@ def test_real_costs_are_those_of_jaxba_at_the_start_and_under_the_same_lambdas(n
     problem = real(name)
     colmap = ColmapProblem(problem)
     assert not colmap.in_python.any()
-    np.testing.assert_allclose(0.5 * np.sum(colmap.residuals() ** 2), geometry.cost(problem), rtol=1e-12)
+    np.testing.assert_allclose(
+        0.5 * np.sum(np.square(colmap.ceres.evaluate_residuals())), geometry.cost(problem), rtol=1e-12
+    )
     policy = Schedule(values=(1e-4, 1e-5, 1e-3, 1e-6))
     found = drive_ceres(problem, "dense", policy, max_iterations=8, tolerances=NEVER)
     ours = solve(problem, policy, MANIFOLD, max_iterations=8, tolerances=NEVER)
