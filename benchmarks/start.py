@@ -3,16 +3,18 @@
     python -m benchmarks.start [PROBLEM ...] [--repeats 5] [--python PATH] [--out FILE]
 
 PROBLEM is a file or a folder of a COLMAP model below `JAXBA_DATA`. Calls are timed with an empty cache of compiled
-programs (cold), again with what the first has stored (warm), and then on another problem of about the same size: the
-same one without 3% of its points, or for the long sequence of KITTI another window of 40 cameras. Reading and writing
-count. Beside them stand pycolmap's bundle adjustment of a COLMAP model, which reads and writes it too, and C++ Ceres on
-a BAL file (`JAXBA_CERES`) in the faster of its direct modes. `empty` is a process that runs an empty program of JAX.
-`--python` repeats all of it with a second interpreter, for another version of JAX. Seconds are medians.
+programs (cold), again with what the first has stored and another process has compiled after it (warm), and then on
+another problem of about the same size: the same one without 3% of its points, or for the long sequence of KITTI another
+window of 40 cameras. Reading and writing count. Beside them stand pycolmap's bundle adjustment of a COLMAP model, which
+reads and writes it too, and C++ Ceres on a BAL file (`JAXBA_CERES`) in the faster of its direct modes. `empty` is a
+process that runs an empty program of JAX. `--python` repeats all of it with a second interpreter, for another version
+of JAX. Seconds are medians.
 """
 
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import statistics
 import subprocess
@@ -32,6 +34,7 @@ from benchmarks.padding import windows
 from jaxba import BundleProblem, read_problem, write_bal
 from jaxba.bench.run import machine
 from jaxba.cli.common import CACHE_VARIABLE
+from jaxba.runtime.background import LOCK
 from jaxba.runtime.process import threads
 from jaxba.solver.options import MAX_ITERATIONS
 
@@ -115,13 +118,23 @@ def seconds(python: str, code: str, *arguments: Path, cache: str = "off") -> flo
     return elapsed
 
 
+def settle(cache: Path) -> None:
+    """Waits until no process compiles programs for later calls into a cache."""
+    time.sleep(2)  # until it has begun
+    for lock in cache.rglob(LOCK):
+        with lock.open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+
+
 def calls(python: str, first: Path, other: Path, folder: Path) -> dict[str, float]:
     """Seconds of one call of each kind."""
     target = folder / ("solved" if first.is_dir() else "solved.txt")
     output = (Path("--output"), target)
     with tempfile.TemporaryDirectory() as cache:
         found = {"empty": seconds(python, EMPTY)}
-        found |= {name: seconds(python, SOLVE, first, *output, cache=cache) for name in ("cold", "warm")}
+        for name in ("cold", "warm"):
+            found[name] = seconds(python, SOLVE, first, *output, cache=cache)
+            settle(Path(cache))
         found["other"] = seconds(python, SOLVE, other, *output, cache=cache)
     if first.is_dir():
         if find_spec("pycolmap"):

@@ -41,8 +41,10 @@ COST_DEFINITION_TOLERANCE = 1e-5
 """Relative difference of initial costs above which rounding cannot be the reason. float32 makes about 1e-6; ignoring
 the 31 observations of Ladybug-49 whose points are behind their cameras, as COLMAP does, makes 1.3e-4."""
 
-CONVERGED = frozenset({"cost", "step", "gradient", "rounding", "converged", "convergence", "ftol", "xtol", "gtol"})
-"""Values of `Record.termination`, in lower case, that mean converged; all others mean failed. The first four are
+CONVERGED = frozenset(
+    {"cost", "step", "gradient", "rounding", "within", "converged", "convergence", "ftol", "xtol", "gtol"}
+)
+"""Values of `Record.termination`, in lower case, that mean converged; all others mean failed. The first five are
 members of `Termination`; other libraries write "converged" or "CONVERGENCE"."""
 
 

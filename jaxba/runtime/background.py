@@ -1,8 +1,8 @@
 """Programs that a later process will want, compiled by a process of their own after this one.
 
 A call that ran quickly compiled programs for long leaves the fully optimised ones to such a process. It has the lowest
-priority, one at a time works for a folder of programs, and the system ends it after `LIMIT_S` seconds of processor
-time. It gets what to compile through a pipe; nothing that lies on disk is unpickled.
+priority and one core, one at a time works for a folder of programs, and the system ends it after `LIMIT_S` seconds of
+processor time. It gets what to compile through a pipe; nothing that lies on disk is unpickled.
 """
 
 from __future__ import annotations
@@ -81,6 +81,8 @@ def main() -> None:
     import resource
 
     os.nice(19)
+    if hasattr(os, "sched_setaffinity"):  # one core: the next command may run at the same time
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
     settings, dtype, wanted = pickle.loads(sys.stdin.buffer.read())
     with (wanted[0].path.parent / LOCK).open("w") as lock:

@@ -40,9 +40,9 @@ from jaxba.solver.drivers import Driver
 from jaxba.solver.iteration import Carry, advance, begin, problem_info
 from jaxba.structure.layout import Layout, num_partitions
 
-WORTH_S = 0.15
-"""Seconds of quickly compiled iterations from which on better programs are compiled for later calls: a seventh of the
-shortest call."""
+WORTH_S = 0.3
+"""Seconds of quickly compiled iterations from which on better programs are compiled for later calls, which spares them
+three quarters of it."""
 
 NEVER = sys.maxsize
 """Iterations before a step is fully optimised, if it never is."""

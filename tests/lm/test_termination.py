@@ -80,7 +80,7 @@ def test_of_what_comes_after_a_rejected_or_shortened_step_nothing_is_known():
     assert (np.diff(distance_to_end(steps)[1:]) > 0).all()
 
 
-@pytest.mark.parametrize("rule", ["guarded", "ceres"])
+@pytest.mark.parametrize("rule", ["nielsen", "ceres"])
 def test_a_solve_ends_as_near_to_its_end_as_asked_for(rule):
     scene = random_scene(SceneConfig(cameras=20, points=150), 0)
     whole = solve(scene, rule)

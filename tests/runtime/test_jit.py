@@ -32,8 +32,6 @@ crashes (jax-ml/jax#39257), `jaxba.runtime.jit` can go."""
 OWN_OPTIONS = {"runtime/jit.py", "runtime/compilation.py"}
 """Files that may say `jax.jit`: they give the options themselves."""
 
-ONLY_LOWERED = {"runtime/process.py"}
-
 
 def squares(x):
     return jax.vmap(lambda row: jnp.sum((jnp.eye(3, dtype=x.dtype) @ row) ** 2))(x)
@@ -81,7 +79,7 @@ def test_no_module_compiles_without_the_options():
                 name = next((alias.name for alias in node.names if alias.name in ("jit", "pmap")), "")
             if name in ("jit", "pmap"):
                 found.add(file.relative_to(folder).as_posix())
-    assert found == OWN_OPTIONS | ONLY_LOWERED
+    assert found == OWN_OPTIONS
 
 
 def test_an_option_that_a_jaxlib_does_not_know_is_left_out():

@@ -104,7 +104,7 @@ def test_what_is_read_is_the_readers_own():
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"a": "extends: plane"}, "{0}/a.yaml: extends: no configuration 'plane'; known: default, paper"),
+        ({"a": "extends: plane"}, "{0}/a.yaml: extends: no configuration 'plane'; known: default, fast, paper"),
         ({"a": "extends: b.yaml"}, "{0}/a.yaml: extends: b.yaml: No such file or directory"),
         ({"a": "extends: ./"}, "{0}/a.yaml: extends: ./: Is a directory"),
         ({"a": "extends: [plain]"}, "{0}/a.yaml: extends must be a name or the path of a file, is ['plain']"),
