@@ -98,7 +98,7 @@ class Step:
     """How a step is computed."""
 
     policy: Annotated[str, "NAME"] = DEFAULT_POLICY
-    """Damping policy, which chooses lambda: guarded (1e-7, then 1e-8 until a step fails), bold (the smallest lambda
+    """Damping policy, which chooses lambda: guarded (1e-6, then 1e-8 until a step fails), bold (the smallest lambda
     that the guard of agents allows), learned (the shipped network, without embedded iterations), a .safetensors file of
     jaxba-train, or a rule: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most
     rules take the first lambda, as in classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is

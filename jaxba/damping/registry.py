@@ -46,7 +46,7 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "theseus": (theseus, "Theseus' adaptive rule: 1e-3, then x1/9 or x11"),
     "schedule": (Schedule, "the paper's cycle 1e-15, 1e-15, 0.194, 0.551"),
     "gauss-newton": (gauss_newton, "next to no damping: 1e-10 throughout"),
-    GUARDED: (Guarded, "1e-7, then 1e-8, raised by half a decade after a failure; Ceres' rule after two in a row"),
+    GUARDED: (Guarded, "1e-6, then 1e-8, raised by half a decade after a failure; Ceres' rule after two in a row"),
     BOLD: (bold, "the smallest lambda that the guard of agents allows: 1e-5, then /32 down to 1e-9"),
 }
 """Factory and one line of description by name."""
