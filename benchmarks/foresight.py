@@ -43,7 +43,7 @@ from jaxba.damping.guard import action_of
 from jaxba.damping.learned import AgentPolicy, ConstantAction
 from jaxba.game.env import Episode, Game, GameConfig, make_game
 from jaxba.game.evaluate import best_constant_action
-from jaxba.game.groups import step_groups
+from jaxba.runtime.groups import step_groups
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import Bank, BankConfig, make_banks
 from jaxba.game.statistics import paired_ratio

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 
 from jaxba import LMState
 from jaxba.damping import POLICIES, DampingPolicy, ProblemInfo
-from jaxba.game.groups import step_groups
+from jaxba.runtime.groups import step_groups
 from jaxba.game.random_scenes import SceneClass, SceneFamily, Scenes, make_scenes
 from jaxba.game.scene_bank import info_of, initial_costs
 from jaxba.game.scene_layout import class_layout, with_scene

@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from jaxba.results.covariance import Covariance, covariance
     from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
     from jaxba.results.retriangulate import Retriangulation, retriangulate
+    from jaxba.solver.many import solve_many
     from jaxba.training.api import make_env, train
     from jaxba.viewer.notebook import view
 
@@ -82,6 +83,7 @@ _LATE = {
     "results.covariance": ("Covariance", "covariance"),
     "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
     "results.retriangulate": ("Retriangulation", "retriangulate"),
+    "solver.many": ("solve_many",),
     "training.api": ("make_env", "train"),
     "viewer.notebook": ("view",),
 }
@@ -169,6 +171,7 @@ __all__ = [
     "solve",
     "solve_and_retriangulate",
     "solve_loop",
+    "solve_many",
     "train",
     "trained_step",
     "view",

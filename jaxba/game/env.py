@@ -29,7 +29,6 @@ from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import Memory, begin, duration, observation_size, observe, record
 from jaxba.damping.guard import action_of, damping_of
 from jaxba.damping.rules import Ceres
-from jaxba.game.groups import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import Bank
@@ -37,6 +36,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import KINDS, LMState, StepInfo
 from jaxba.lm.step import lm_step
 from jaxba.problem.options import StepOptions, check_known
+from jaxba.runtime.groups import step_groups
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
 

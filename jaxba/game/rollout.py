@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import DampingPolicy
-from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
@@ -25,6 +24,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.solver.iteration import Carry, begin, iterate
+from jaxba.solver.lanes import refill
 
 LANES = 128
 """Scenes solved at a time."""
@@ -62,7 +62,7 @@ def play(
     """
     check_x64(bank.initial_cost.dtype)
     played = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
-    found: Trajectories = jax.tree.map(lambda x: np.asarray(x)[:-1], played)
+    found: Trajectories = jax.tree.map(np.asarray, played)
     costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], found.costs], axis=1)
     past = np.arange(limit + 1) > found.iterations[:, None]
     last = np.take_along_axis(costs, found.iterations[:, None], axis=1)
@@ -73,41 +73,31 @@ def play(
 def _play(
     kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array
 ) -> Trajectories:
-    """`Trajectories` of JAX arrays, with an extra row for idle lanes; costs without the start."""
+    """`Trajectories` of JAX arrays; costs without the start."""
     layout = class_layout(kind, options)
     count = bank.initial_cost.shape[0]
-    lanes = min(LANES, count)
 
-    def fresh(scene: Int[Array, ""]) -> tuple[Array, Carry]:
-        at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)  # idle lanes repeat the last
+    def fresh(scene: Int[Array, ""]) -> Carry:
+        at = lambda tree: jax.tree.map(lambda x: x[scene], tree)
         start = at(bank.scenes)
         state = LMState(start.cameras, start.points, at(bank.initial_cost))
-        return scene, begin(at(bank.info), policy, state)
+        return begin(at(bank.info), policy, state)
 
-    def advance(scene: Array, carry: Carry) -> tuple[Carry, StepInfo]:
-        row = jnp.minimum(scene, count - 1)
-        seen = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
-        return iterate(seen, carry, policy, Tolerances(), options, limit)
+    def advance(scene: Int[Array, ""], carry: Carry) -> tuple[Carry, tuple[StepInfo, Array], Bool[Array, ""]]:
+        seen = with_scene(layout, bank.scenes.pixels[scene], bank.scenes.mask[scene])
+        carry, step = iterate(seen, carry, policy, Tolerances(), options, limit)
+        converged = converged_in_cost(step, ftol)
+        return carry, (step, converged), converged | (carry.iteration >= limit)
 
-    def body(loop: tuple[Any, ...]) -> tuple[Any, ...]:
-        (scene, carry), next_scene, found = loop
-        carry, step = step_groups(advance, scene, carry)
-        row = jnp.minimum(scene, count)  # idle lanes write to an extra row that is dropped
-        converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
-        iteration = carry.iteration
-        done = converged | (iteration >= limit)
-        found = found._replace(
-            costs=found.costs.at[row, iteration - 1].set(step.cost),
-            dampings=found.dampings.at[row, iteration - 1].set(step.damping),
-            iterations=found.iterations.at[row].set(iteration),
-            converged=found.converged.at[row].set(converged),
+    def note(found: Trajectories, scene: Array, carry: Carry, record: Any, _: Array) -> Trajectories:
+        (step, converged), iteration = record, carry.iteration
+        return Trajectories(
+            costs=found.costs.at[scene, iteration - 1].set(step.cost, mode="drop"),
+            dampings=found.dampings.at[scene, iteration - 1].set(step.damping, mode="drop"),
+            iterations=found.iterations.at[scene].set(iteration, mode="drop"),
+            converged=found.converged.at[scene].set(converged, mode="drop"),
         )
-        new = jax.vmap(fresh)((next_scene + jnp.cumsum(done) - 1).astype(jnp.int32))
-        pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        return jax.tree.map(pick, new, (scene, carry)), (next_scene + jnp.sum(done)).astype(jnp.int32), found
 
-    rows = np.zeros((count + 1, limit), bank.initial_cost.dtype)
-    nothing = Trajectories(rows, rows, np.zeros(count + 1, np.int32), np.zeros(count + 1, bool))
-    first = jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32))
-    loop = first, jnp.asarray(lanes, jnp.int32), jax.tree.map(jnp.asarray, nothing)
-    return lax.while_loop(lambda loop: jnp.any(loop[0][0] < count), body, loop)[2]
+    rows = jnp.zeros((count, limit), bank.initial_cost.dtype)
+    nothing = Trajectories(rows, rows, jnp.zeros(count, jnp.int32), jnp.zeros(count, bool))
+    return refill(count, count, min(LANES, count), fresh, advance, note, nothing)

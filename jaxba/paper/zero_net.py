@@ -28,11 +28,11 @@ from jaxba.damping.features import Memory, StepFeatures
 from jaxba.damping.guard import damping_of
 from jaxba.damping.learned import AgentPolicy, Layer
 from jaxba.game.env import Episode, Game
-from jaxba.game.groups import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
+from jaxba.runtime.groups import step_groups
 from jaxba.runtime.jit import jit
 from jaxba.training import checkpoint
 from jaxba.typing import register_pytree

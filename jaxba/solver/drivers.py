@@ -46,6 +46,11 @@ MIN_LENGTH = 128
 rounded up to a power of two."""
 
 
+def record_length(max_iterations: int) -> int:
+    """The length of the record of a compiled loop."""
+    return max(MIN_LENGTH, 1 << (max(1, max_iterations) - 1).bit_length())
+
+
 class Driver:
     """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives the state at the
     start, and `finish`, which runs all iterations as one program, or `iterate`, which runs one, or both."""
@@ -62,7 +67,7 @@ class Driver:
     def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
         self.setup, self.tolerances, self.clock = setup, tolerances, clock
         self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
-        self.length = max(MIN_LENGTH, 1 << int(self.limit - 1).bit_length())
+        self.length = record_length(max_iterations)
 
     def compile_s(self) -> float:
         """Seconds of compilation so far."""

@@ -132,9 +132,12 @@ def set_up(
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
     away: Int[np.ndarray, " away"] | None = None,
+    capacity: Capacity | None = None,
 ) -> Setup:
-    """`prepare` without the initial state. Arguments and errors as there; `away`: whose views are left out, if that is
-    decided."""
+    """`prepare` without the initial state. Arguments and errors as there.
+
+    `away`: whose views are left out, if that is decided. `capacity`: to which sizes it is padded, if that is decided;
+    the layout then stays on the host."""
     check_problem(problem)
     options = checked_options(options)
     if isinstance(policy, str):
@@ -155,15 +158,19 @@ def set_up(
                 refinement=replace(step.refinement, camera_rounds=0, pattern_moves=0),
             )
         observations = ObservationOrder.of(here)
-        capacity, asked = None, options.linear_solver
-        if len(devices) == 1 and not step.method and asked in ("auto", "explicit") and _pads(observations, options):
+        asked, on_host = options.linear_solver, capacity is not None
+        if on_host:
+            asked = "explicit"
+        elif len(devices) == 1 and not step.method and asked in ("auto", "explicit") and _pads(observations, options):
             # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up to the
             # largest capacity the explicit solver is never slow
             capacity = capacity_of(here, observations)
             asked = asked if capacity is None else "explicit"
         step = choose_linear_solver(here, step, asked, observations, len(devices))
         shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
-        layout = jax.device_put(build_layout(here, step, capacity, observations)) if shards is None else shards.first
+        grid = not on_host  # else a shape would depend on more than the capacity
+        layout = build_layout(here, step, capacity, observations, grid=grid) if shards is None else shards.first
+        layout = layout if shards or on_host else jax.device_put(layout)
         start = (here.cameras, here.points) if capacity is None else padded_parameters(here, capacity)
         setup_s = time.perf_counter() - started
     return Setup(problem, away, found, layout, step, policy, capacity, start, dtype, setup_s, shards)

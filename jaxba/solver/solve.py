@@ -7,14 +7,14 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
-from jaxba.lm.records import StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, distance_to_end
 from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
@@ -184,7 +184,7 @@ def solve_without(
     """`solve` where it is known which images face away; None: it is not. Programs compile in `compiling`."""
     options = checked_options(options)
     setup = set_up(problem, policy, options, away)
-    counted, alone = setup.placed.counted, callback is None and watch is None
+    alone = callback is None and watch is None
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
         driver.compiling = compiling
@@ -213,26 +213,34 @@ def solve_without(
             process.release_programs()  # see above: too many programs end a process
         steps = steps or StepInfo.stacked(records)
         state = driver.carry.state if options.max_iterations else state
-        count, final_cost = len(steps.cost), float(state.cost)
-        gave_up = end in (Termination.DAMPING_LIMIT, Termination.STALLED)
-        if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
-            end = Termination.ROUNDING
-        return Solution(
-            problem=setup.problem_at(state) if count else _unchanged(counted),
-            initial_cost=initial_cost,
-            final_cost=final_cost,
-            iterations=count,
-            accepted=int(np.sum(steps.accepted)),
-            termination=end,
-            history=steps,
-            linear_solver=setup.options.solver_name,
-            setup_s=setup.setup_s,
-            compile_s=compile_s,
-            total_s=total_s,
-            capacity=setup.capacity,
-            quick_iterations=driver.quick_iterations,
-            set_aside=setup.away,
-        )
+        found = solution_of(setup, state, initial_cost, steps, end, total_s)
+        return replace(found, compile_s=compile_s, quick_iterations=driver.quick_iterations)
+
+
+def solution_of(
+    setup: Setup, state: LMState, initial_cost: float, steps: StepInfo, end: Termination, total_s: float
+) -> Solution:
+    """The solution of a solve that ended in a state, without the time of compilation; `initial_cost` in pixels^2,
+    `total_s` in seconds."""
+    count, final_cost, counted = len(steps.cost), float(state.cost), setup.placed.counted
+    gave_up = end in (Termination.DAMPING_LIMIT, Termination.STALLED)
+    if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
+        end = Termination.ROUNDING
+    return Solution(
+        problem=setup.problem_at(state) if count else _unchanged(counted),
+        initial_cost=initial_cost,
+        final_cost=final_cost,
+        iterations=count,
+        accepted=int(np.sum(steps.accepted)),
+        termination=end,
+        history=steps,
+        linear_solver=setup.options.solver_name,
+        setup_s=setup.setup_s,
+        compile_s=0.0,
+        total_s=total_s,
+        capacity=setup.capacity,
+        set_aside=setup.away,
+    )
 
 
 def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Compiled | OnDevices | Stepwise:

@@ -146,7 +146,8 @@ def pair_layout(
         array[position] = row_index[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
     most_of_block = None if capacity is None else -(-room.most // width)
-    sums, levels, by_sums = _batch_sums(chunks, batches, batch, most_of_block, agreement)
+    loosest = capacity is not None and capacity.fixed
+    sums, levels, by_sums = _batch_sums(chunks, batches, batch, most_of_block, agreement, loosest=loosest)
     keys = keys[by_sums]
     table = None
     if factor and not banded:
@@ -223,7 +224,13 @@ def _pairs_of_tracks(
 
 
 def _batch_sums(
-    chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None, agreement: Agreement = ALONE
+    chunks: Int[np.ndarray, " blocks"],
+    batches: int,
+    batch: int,
+    most: int | None,
+    agreement: Agreement = ALONE,
+    *,
+    loosest: bool = False,
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
     """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
 
@@ -233,6 +240,7 @@ def _batch_sums(
         batch: number of chunks of a batch.
         most: largest number of chunks of a block, if all shapes shall follow from that and from the numbers above.
         agreement: with the other shards of a problem.
+        loosest: whether there is room for the worst case.
     """
     block = np.repeat(np.arange(len(chunks)), chunks)
     own_batch, position = np.divmod(np.arange(len(block)), batch)
@@ -245,7 +253,7 @@ def _batch_sums(
     if most is not None:  # nearly always a batch has sums of few blocks; at worst it has as many sums as chunks
         bound = chunks_at_most(batch, len(chunks), TREE_WIDTH)
         usual = min(bound, batch // TREE_WIDTH + 5 * len(chunks) // (2 * batches) + 1)
-        partial = usual if partial <= usual else bound
+        partial = usual if partial <= usual and not loosest else bound
     number = _since(np.diff(sum_batch, prepend=-1) != 0)
     sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
     sums[own_batch, number[np.cumsum(starts_sum) - 1], within % TREE_WIDTH] = position
@@ -258,7 +266,7 @@ def _batch_sums(
     room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
     order = np.argsort(-counts, kind="stable")
     items = items[np.argsort(np.argsort(order)[target], kind="stable")]
-    return sums, prefix_levels(items, counts[order], empty, room), order[:-1]
+    return sums, prefix_levels(items, counts[order], empty, room, loosest=loosest), order[:-1]
 
 
 def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

@@ -64,6 +64,10 @@ class Capacity:
     pairs: int
     """Number of pairs of observations of one point, an observation with itself included."""
 
+    fixed: bool = False
+    """Whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a
+    point twice. Else they are smaller where the problem is a usual one."""
+
     def holds(self, observations: ObservationOrder) -> bool:
         """Whether the problem fits; its pairs are not counted."""
         counts = observations.num_cameras, len(observations.tracks), slots_for(observations.tracks)
@@ -72,7 +76,7 @@ class Capacity:
     def usual_observations(self, count: int) -> int:
         """Room for the observations of a problem: 15/16 of the slots or, where points have few single slots, all."""
         usual = self.observations * 15 // 16
-        return usual if count <= usual else self.observations
+        return usual if count <= usual and not self.fixed else self.observations
 
     def __str__(self) -> str:
         return f"{self.cameras} cameras, {self.points} points, {self.observations} observations, {self.pairs} pairs"

@@ -95,7 +95,7 @@ problems the first one suffices, or the second where tracks are long."""
 
 
 def prefix_levels(
-    items: np.ndarray, counts: np.ndarray, empty: int, room: Room, first: int = 0
+    items: np.ndarray, counts: np.ndarray, empty: int, room: Room, first: int = 0, *, loosest: bool = False
 ) -> tuple[Int[np.ndarray, "_ _"], ...]:
     """Index arrays that sum the items of targets with descending counts: rank by rank, over prefixes of the targets.
 
@@ -109,6 +109,7 @@ def prefix_levels(
         empty: index of a row of zeros, for padding.
         room: bounds from which the shapes follow, together with the number of targets.
         first: first rank that is listed. Rank 0 is listed for all targets.
+        loosest: whether it is the last one in any case.
     """
     if len(items) > room.items or counts.max(initial=0) > room.most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
@@ -117,7 +118,7 @@ def prefix_levels(
         ranks.append(max(1, 2 * ranks[-1]))
     begins, ends = ranks[:-1], ranks[1:]
     present = [np.count_nonzero(counts > rank) for rank in begins]
-    for share in PREFIX_SHARES:
+    for share in PREFIX_SHARES[-1:] if loosest else PREFIX_SHARES:
         lengths = [min(len(counts), int(room.items * share(rank))) if rank else len(counts) for rank in begins]
         if all(n <= length for n, length in zip(present, lengths, strict=True)):
             break

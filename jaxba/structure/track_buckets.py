@@ -124,7 +124,7 @@ def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slot
         point=np.tile(chunk_point, POINT_CHUNK),
         points=members,
         buckets=(),
-        levels=prefix_levels(chunk, all_counts, chunks - 1, room, first=1),
+        levels=prefix_levels(chunk, all_counts, chunks - 1, room, first=1, loosest=capacity.fixed),
         empty=chunks - 1,
     )
 

@@ -17,7 +17,6 @@ from jaxba.damping.features import observation_size
 from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.game.env import GameConfig
 from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
-from jaxba.game.groups import GROUP, step_groups
 from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import (
     MOST_CAMERAS,
@@ -32,6 +31,7 @@ from jaxba.game.statistics import paired_ratio
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step
 from jaxba.problem.options import Refinement
+from jaxba.runtime.groups import GROUP, step_groups
 
 LIMIT = 25
 

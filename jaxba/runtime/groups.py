@@ -1,4 +1,4 @@
-"""`jax.vmap` over scenes, in groups of a size that suits a CPU."""
+"""`jax.vmap` in groups of a size that suits a CPU."""
 
 from __future__ import annotations
 

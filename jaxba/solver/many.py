@@ -1,0 +1,304 @@
+"""`solve_many`: a stream of problems of any shapes, solved as few programs.
+
+Problems are padded to cells (structure/cells.py), chosen from the first ones that come. A bank holds problems of one
+cell and is solved by one call of a program (lanes.py), in a thread: as many threads as there are cores, or GPUs. What
+fits no cell, and what would not pay for compiling, is solved by `solve`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxba.damping import DampingPolicy
+from jaxba.lm.records import LMState
+from jaxba.lm.termination import Termination
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.runtime import process
+from jaxba.runtime.compilation import Level, ParallelCompilation, program
+from jaxba.runtime.numerics import numerics
+from jaxba.solver.drivers import record_length
+from jaxba.solver.lanes import Ends, Starts, solve_rows
+from jaxba.solver.names import resolve_policy
+from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.place import check_problem, placed
+from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
+from jaxba.solver.solve import Solution, solution_of, solve
+from jaxba.structure.cells import Sizes, cell_for, choose_cells
+
+BANK = 32
+"""Problems of a bank for each lane; on a CPU it has one lane, and half a second of work."""
+
+GPU_LANES = 256
+"""Lanes of a bank on a GPU."""
+
+SEEN = 512
+"""Most problems from whose sizes cells are chosen at a time."""
+
+SEEN_S = 0.5
+"""Longest time, in seconds, that is waited for them."""
+
+WORTH = 16
+"""Problems of a cell that pay for compiling its program; those of a smaller cell go to a larger one, if they fit."""
+
+ENDLESS = 10_000
+"""Problems that are expected of a stream of unknown length."""
+
+AHEAD = 4 * SEEN
+"""Most problems in memory."""
+
+Result = Solution | Exception
+"""What a problem ends with."""
+
+
+def solve_many(
+    problems: Iterable[BundleProblem],
+    policy: str | DampingPolicy = DEFAULT_POLICY,
+    options: SolveOptions | None = None,
+) -> Iterator[Result]:
+    """Solves any number of problems of any shapes, and gives their results in order, each as soon as it is there.
+
+    What a problem of the stream ends with is what `solve` alone gives, to rounding (padding changes the order of sums).
+    One that cannot be solved gives the exception that `solve` would raise, and the others go on. The first result comes
+    before any program for many is compiled; a list of fewer than some hundred problems is solved by `solve`. An endless
+    stream runs in constant memory: at most `AHEAD` problems are read before their turn.
+
+    Lanes are for the method `lm` with a factorisation, on one device each; with other options every problem is solved
+    by `solve`. Problems with lenses, rigs or residuals share a program where they have as many cameras, and as many
+    rows of each residual.
+
+    Args:
+        problems: starts of the optimisation; read by the thread that asks for results.
+        policy: as for `solve`.
+        options: as for `solve`; they hold for all.
+
+    Raises:
+        ValueError: bad options, before the first result.
+    """
+    options = checked_options(options)
+    if isinstance(policy, str):
+        policy, options = resolve_policy(policy, options)
+    options.step_options(policy)
+    return _results(problems, policy, options)
+
+
+def _results(problems: Iterable[BundleProblem], policy: DampingPolicy, options: SolveOptions) -> Iterator[Result]:
+    stream = iter(problems)
+    for first in itertools.islice(stream, 1):
+        yield _alone(policy, options, first)
+    many = _Many(policy, options, len(problems) - 1 if isinstance(problems, Sized) else None)
+    try:
+        waiting = deque[Future[Result]]()
+        for problem in stream:
+            waiting.append(many.add(problem))
+            while waiting and (waiting[0].done() or len(waiting) >= AHEAD):
+                yield many.result(waiting.popleft())
+        many.flush()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        many.close()
+
+
+def _alone(policy: DampingPolicy, options: SolveOptions, problem: BundleProblem) -> Result:
+    try:
+        return solve(problem, policy, options)
+    except Exception as error:
+        return error
+
+
+class _Job(NamedTuple):
+    """A problem of the stream, and the result that it will have."""
+
+    problem: BundleProblem
+    result: Future[Result]
+
+
+class _Many:
+    """Cells, banks that are being filled, and the threads that solve them."""
+
+    def __init__(self, policy: DampingPolicy, options: SolveOptions, expected: int | None) -> None:
+        """`expected`: how many problems come; None if that is not known."""
+        self._policy, self._options, self._expected = policy, options, expected
+        here = jax.local_devices()
+        on_cpu = here[0].platform == "cpu"
+        self._devices = here[:1] * process.threads() if on_cpu else here
+        self._lanes = 1 if on_cpu else GPU_LANES
+        self._pool, self._busy, self._turn = ThreadPoolExecutor(len(self._devices)), 0, itertools.count()
+        self._bank = BANK * self._lanes
+        self._unsorted: list[tuple[_Job, Sizes]] = []
+        self._began, self._cells = time.monotonic(), list[Sizes]()
+        self._filling: dict[Sizes, list[_Job]] = {}
+        self._programs: dict[Any, _Program] = {}
+        self._lock = threading.Lock()
+        plain = options.linear_solver in ("auto", "explicit") and not options.step_options(policy).method
+        self._in_lanes = plain and options.max_iterations > 0 and options.devices in (None, 1)
+
+    def add(self, problem: BundleProblem) -> Future[Result]:
+        """The result that a problem will have."""
+        job = _Job(problem, Future())
+        try:
+            check_problem(problem)
+            sizes = _sizes(problem) if self._in_lanes else None
+        except Exception as error:
+            job.result.set_result(error)
+            return job.result
+        if sizes is None:
+            self._begin(self._solve_alone, job)
+        elif (cell := cell_for(sizes, self._cells)) is not None:
+            self._fill(cell, job)
+            if self._busy < len(self._devices):
+                self._submit(max(self._filling, key=lambda cell: len(self._filling[cell])))
+        else:
+            self._unsorted.append((job, sizes))
+            if len(self._unsorted) >= SEEN or time.monotonic() - self._began > SEEN_S:
+                self._sort(endless=True)
+        return job.result
+
+    def result(self, of: Future[Result]) -> Result:
+        """A result whose turn it is, though other problems are to come."""
+        if not of.done():
+            self.flush(endless=True)
+        return of.result()
+
+    def flush(self, *, endless: bool = False) -> None:
+        """Begins what was added, though banks are not full; `endless`: more will come."""
+        self._sort(endless=endless)
+        for cell in list(self._filling):
+            self._submit(cell)
+
+    def close(self) -> None:
+        """Ends after what is being solved."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _sort(self, *, endless: bool) -> None:
+        """Chooses cells for problems that fit none."""
+        unsorted, self._unsorted, self._began = self._unsorted, [], time.monotonic()
+        if not unsorted:
+            return
+        expected = self._expected if self._expected is not None else ENDLESS * endless
+        every, times = [sizes for _, sizes in unsorted], max(1.0, expected / len(unsorted))
+        cells = choose_cells(every, times)
+        members = Counter(cell_for(sizes, cells) for sizes in every)
+        cells = [cell for cell in cells if members[cell] * times >= WORTH]
+        for job, sizes in unsorted:
+            cell = cell_for(sizes, cells)
+            if cell is None:
+                self._begin(self._solve_alone, job)
+            else:
+                self._fill(cell, job)
+
+    def _fill(self, cell: Sizes, job: _Job) -> None:
+        if cell not in self._cells:
+            self._cells.append(cell)
+        self._filling.setdefault(cell, []).append(job)
+        if len(self._filling[cell]) == self._bank:
+            self._submit(cell)
+
+    def _submit(self, cell: Sizes) -> None:
+        if bank := self._filling.pop(cell, None):
+            self._begin(self._solve, cell, bank, self._devices[next(self._turn) % len(self._devices)])
+
+    def _begin(self, work: Callable[..., None], *arguments: Any) -> None:
+        """Work for a thread."""
+
+        def run() -> None:
+            work(*arguments)
+            with self._lock:
+                self._busy -= 1
+
+        with self._lock:
+            self._busy += 1
+        self._pool.submit(run)
+
+    def _solve_alone(self, job: _Job) -> None:
+        job.result.set_result(_alone(self._policy, self._options, job.problem))
+
+    def _solve(self, cell: Sizes, bank: Sequence[_Job], device: jax.Device) -> None:
+        """Solves a bank."""
+        groups: dict[Any, list[tuple[Setup, _Job]]] = {}
+        with numerics(np.float32 if self._options.dtype == "float32" else np.float64), jax.default_device(device):
+            for job in bank:
+                try:
+                    setup = set_up(job.problem, self._policy, self._options, capacity=cell.capacity)
+                except Exception as error:
+                    job.result.set_result(error)
+                    continue
+                leaves, tree = jax.tree.flatten(setup.layout)
+                groups.setdefault((setup.options, tree, *(x.shape for x in leaves)), []).append((setup, job))
+            for key, group in groups.items():
+                if len(group) < len(bank) / 4 and key not in self._programs:  # of unusual shape
+                    for _, job in group:
+                        self._begin(self._solve_alone, job)
+                else:
+                    self._solve_group(key, device, group)
+
+    def _solve_group(self, key: Any, device: jax.Device, group: list[tuple[Setup, _Job]]) -> None:
+        """Solves problems of one shape. A program is compiled by the first thread that needs it; others do what else
+        there is."""
+        with self._lock:
+            one = self._programs.setdefault(key, _Program("quick" if self._options.compilation == "quick" else "full"))
+        if not one.ready.wait(0) and not one.first.acquire(blocking=False):
+            one.ready.wait(0.1)
+            return self._begin(self._again, key, device, group)
+        began, setups = time.perf_counter(), [setup for setup, _ in group]
+        try:
+            ends = one.run(setups, self._bank, self._options, self._lanes)
+        except Exception as error:
+            for _, job in group:
+                job.result.set_result(error)
+            return None
+        seconds = (time.perf_counter() - began) / len(group)
+        for number, (setup, job) in enumerate(group):
+            job.result.set_result(_solution(setup, jax.tree.map(lambda x, k=number: x[k], ends), seconds))
+        return None
+
+    def _again(self, key: Any, device: jax.Device, group: list[tuple[Setup, _Job]]) -> None:
+        with numerics(group[0][0].dtype), jax.default_device(device):
+            self._solve_group(key, device, group)
+
+
+class _Program:
+    """The program of problems of one shape."""
+
+    def __init__(self, level: Level) -> None:
+        self._function, self._programs = (
+            program(solve_rows, "options", "length", "lanes", level=level),
+            ParallelCompilation(),
+        )
+        self.first, self.ready = threading.Lock(), threading.Event()
+
+    def run(self, setups: Sequence[Setup], size: int, options: SolveOptions, lanes: int) -> Ends:
+        """The ends of a bank of so many problems, of which there may be fewer."""
+        one, dtype = setups[0], setups[0].dtype
+        rows = [Starts(each.layout, *(x.astype(dtype) for x in each.start)) for each in setups]
+        rows += [rows[-1]] * (size - len(rows))
+        starts = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+        limit, used = (np.asarray(n, np.int32) for n in (options.max_iterations, len(setups)))
+        given = starts, one.policy, options.tolerances, limit, used, one.options, record_length(int(limit)), lanes
+        ends = jax.tree.map(np.asarray, self._programs.run(self._function, *given))
+        self.ready.set()
+        return ends
+
+
+def _sizes(problem: BundleProblem) -> Sizes | None:
+    """Those of a problem as it is laid out."""
+    return Sizes.of(placed(problem).here if problem.rigs is not None or problem.residuals else problem)
+
+
+def _solution(setup: Setup, end: Ends, seconds: float) -> Result:
+    try:
+        setup.check_cost(LMState(*end.state[:2], end.initial_cost))
+        count = int(end.iterations)
+        steps = jax.tree.map(lambda x: x[:count], end.history)
+        return solution_of(setup, end.state, float(end.initial_cost), steps, Termination(int(end.termination)), seconds)
+    except Exception as error:
+        return error

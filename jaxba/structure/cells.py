@@ -1,0 +1,107 @@
+"""Cells: the capacities to which many problems of different sizes are padded, so that they share few programs.
+
+They are chosen from the sizes of problems that were seen, as few or as many as make the predicted time of compiling and
+solving the shortest.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.structure.observation_order import ObservationOrder
+from jaxba.structure.padding import MAX_CAMERAS, MAX_OBSERVATIONS, MAX_PAIRS, Capacity, slots_for
+
+ROUNDED = np.array([1, 16, 64, 256])
+"""Sizes of cells are multiples of these, so that later problems fit."""
+
+FIXED_S, CUBE_S, EACH_S = 5e-5, 2.5e-11, np.array([1e-5, 7e-7, 2.7e-7, 6e-9])
+"""Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that is padding. Measured
+on windows of 5 to 20 cameras, on a core of an x86-64 processor with AVX-512. Batches of pairs without any cost nothing,
+so that the work for pairs themselves is the same in every cell."""
+
+ITERATIONS = 20
+"""Iterations of a solve, as far as that matters for the number of cells."""
+
+COMPILE_S = 8.0
+"""Seconds in which one core traces and compiles the program of a cell."""
+
+
+class Sizes(NamedTuple):
+    """Sizes of a problem, or of a cell."""
+
+    cameras: int
+    points: int
+    slots: int
+    pairs: int
+    exactly: int  # number of cameras that its cell must have, since not all that it holds can be padded; 0: any
+
+    @classmethod
+    def of(cls, problem: BundleProblem) -> Sizes | None:
+        """Those of a problem as it is laid out; None if it is too large for a cell."""
+        observations = ObservationOrder.of(problem)
+        cameras, tracks = observations.num_cameras, observations.tracks
+        pairs, slots = observations.num_pairs + observations.num_repeated_pairs, slots_for(tracks)
+        if cameras > MAX_CAMERAS or slots > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
+            return None
+        general = problem.lenses is not None or problem.rigs is not None or bool(problem.residuals)
+        return cls(cameras, len(tracks), slots, pairs, cameras if general else 0)
+
+    @property
+    def capacity(self) -> Capacity:
+        """That of a cell."""
+        return Capacity(self.cameras, self.points, self.slots, self.pairs, fixed=True)
+
+    def fits(self, cell: Sizes) -> bool:
+        """Whether a problem of these sizes can be padded to a cell."""
+        within = all(own <= room for own, room in zip(self[:4], cell[:4], strict=True))
+        return self.exactly == cell.exactly and within
+
+
+def work(sizes: Int[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+    """Predicted seconds of an iteration, for rows of sizes."""
+    return FIXED_S + np.asarray(sizes, float) @ EACH_S + CUBE_S * (9.0 * sizes[:, 0]) ** 3
+
+
+def choose_cells(seen: Iterable[Sizes], times: float) -> list[Sizes]:
+    """Cells for problems of such sizes, of which `times` as many are to come."""
+    kinds: dict[int, list[Sizes]] = {}
+    for one in seen:
+        kinds.setdefault(one.exactly, []).append(one)
+    return [cell for each in kinds.values() for cell in _cells_of_kind(each, times)]
+
+
+def _cells_of_kind(seen: Sequence[Sizes], times: float) -> list[Sizes]:
+    """Dynamic programming over problems sorted by work: a cell holds neighbours."""
+    rows = -(-np.array([one[:4] for one in seen]) // ROUNDED) * ROUNDED
+    rows, counts = np.unique(rows, axis=0, return_counts=True)
+    order = np.argsort(work(rows), kind="stable")
+    rows, counts = rows[order], counts[order] * times * ITERATIONS
+    number, before = len(rows), np.concatenate([[0], np.cumsum(counts)])
+    price = np.full((number + 1, number + 1), np.inf)  # of one cell, by the first of its rows and the one after them
+    for first in range(number):
+        price[first, first + 1 :] = work(np.maximum.accumulate(rows[first:])) * (before[first + 1 :] - before[first])
+    best, cuts, saved = price[0], [], np.inf
+    while True:
+        with_one_more = best[:, None] + price
+        saved = best[-1] - with_one_more[:, -1].min()
+        if saved <= COMPILE_S:
+            break
+        cuts.append(with_one_more.argmin(axis=0))
+        best = with_one_more.min(axis=0)
+    ends = [number]
+    for cut in reversed(cuts):
+        ends.append(int(cut[ends[-1]]))
+    cells = (rows[first:last].max(axis=0) for first, last in itertools.pairwise(sorted({0, *ends})))
+    return [Sizes(*map(int, cell), seen[0].exactly) for cell in cells]
+
+
+def cell_for(sizes: Sizes, cells: Sequence[Sizes]) -> Sizes | None:
+    """The cell in which a problem is the least work; None if it fits none."""
+    fitting = [cell for cell in cells if sizes.fits(cell)]
+    return min(fitting, key=lambda cell: float(work(np.array([cell[:4]]))[0]), default=None)
