@@ -122,8 +122,7 @@ def best_cost(records: Iterable[Record]) -> dict[str, float]:
 
 
 def lowest_cost(record: Record) -> float:
-    """The lowest finite accepted cost of a run, NaN if there is none. The trace of a float32 run is ignored, since its
-    rounding errors are too large."""
+    """The lowest finite accepted cost of a run, or NaN. A float32 run's trace is ignored for its rounding errors."""
     trace = [] if record.dtype == "float32" else [point.cost for point in record.trace]
     return min(filter(math.isfinite, (record.final_cost, *trace)), default=math.nan)
 
@@ -215,8 +214,7 @@ def _ratio(time: float, best: float) -> float:
 
 
 def cost_warnings(records: Sequence[Record]) -> list[str]:
-    """A warning for each problem on which solvers have different initial costs, and so did not minimise the same
-    function from the same start."""
+    """A warning for each problem on which initial costs of solvers differ: they minimised different functions."""
     lines = []
     for name, runs in by_problem(records).items():
         costs = {r.solver: r.initial_cost for r in runs if math.isfinite(r.initial_cost)}

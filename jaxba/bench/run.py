@@ -182,8 +182,7 @@ def _results(path: Path) -> list[Record]:
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a COLMAP model. Empty if a file cannot be read; reading the problem or the
-    policy reports that later."""
+    """SHA-256 of a file, or of all files of a COLMAP model. Empty if one cannot be read: later reading reports it."""
     total = hashlib.sha256()
     try:
         for part in visible(path) if path.is_dir() else [path]:

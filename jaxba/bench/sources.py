@@ -94,8 +94,7 @@ def _same(one: str, other: str) -> bool:
 
 
 def _model_name(folder: Path) -> str:
-    """Name of a COLMAP model: the name of its folder, preceded by those above it up to the first that is not generic,
-    e.g. `garden-sparse-0`."""
+    """Name of a COLMAP model: that of its folder, after those above up to one not generic: `garden-sparse-0`."""
     parts = list(folder.resolve().parts[1:]) or ["model"]
     count = next((k for k, part in enumerate(reversed(parts), 1) if not _GENERIC_FOLDER.fullmatch(part)), len(parts))
     return "-".join(parts[-count:])

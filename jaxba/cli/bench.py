@@ -139,8 +139,7 @@ def _check_apart(folder: Path, args: Arguments, jobs: Any) -> None:
 def _run_missing(
     folder: Path, done: Any, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str
 ) -> int:
-    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError if a file cannot be
-    written."""
+    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError: it cannot."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

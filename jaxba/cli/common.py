@@ -43,9 +43,8 @@ def run_command(
     argv: Sequence[str] | None,
     subcommand: str = "",
 ) -> int:
-    """Parses the command line and runs `main`. Expected errors are printed as one line to stderr, and so is a Ctrl-C or
-    SIGTERM that `main` does not handle. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or
-    143 after SIGTERM.
+    """Parses the command line and runs `main`. Expected errors, and signals that `main` does not handle, are one line
+    on stderr. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
 
     Args:
         arguments: class of the arguments, made by `options`, in the module that has the command's name.
@@ -150,8 +149,7 @@ def exit_with(status: int) -> NoReturn:
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK. `untraced` says
-    which cache: see `use_compilation_cache`."""
+    """Keeps freed memory, loads LAPACK, and enables the cache of programs; `untraced`: see `use_compilation_cache`."""
     from jaxba.runtime import process
 
     process.keep_memory()
@@ -216,9 +214,8 @@ def require(fulfilled: bool, message: str) -> None:
 
 
 def check_writable(option: str, path: str | None) -> None:
-    """Checks that the file of an output option can be written, before any work is done; None and the names of streams
-    are accepted. Raises UsageError: the folder is missing or not writable, the file is read-only, or the path is that
-    of a folder."""
+    """Checks that an output file can be written, before any work; None and names of streams are accepted. Raises
+    UsageError: the folder is missing or not writable, the file is read-only, or the path is that of a folder."""
     from jaxba.io.files import STREAMS
 
     if path is None or path.startswith(STREAMS):
@@ -255,8 +252,7 @@ def check_folder(option: str, path: str) -> None:
 
 def check_positive(**values: Any) -> None:
     """Checks that numbers are positive, that tolerances (names ending in `tol`) are not negative, and that integers are
-    not too large for 32 bits. Values are given by argument name. Raises UsageError: a value is invalid; the message
-    names the option."""
+    not too large for 32 bits. Values are by argument name. Raises UsageError: an invalid value; names the option."""
     from jaxba.typing import LARGEST_COUNT
 
     for name, value in values.items():

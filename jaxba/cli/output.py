@@ -59,8 +59,7 @@ def check_storable(output: str | None, problem: BundleProblem, source: str | Non
 
 
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
-    """Writes the solution, and prints what was written and what the file format cannot store. Raises UsageError: the
-    solution cannot be written."""
+    """Writes the solution, and prints what was written and what the file cannot store. Raises UsageError: it fails."""
     model, like = is_model(output, source), _is_like_source(output, source)
     try:
         if like:

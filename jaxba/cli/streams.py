@@ -14,8 +14,7 @@ from typing import Any
 
 
 class UnwritableStreamError(Exception):
-    """Standard output cannot be written, for another reason than that its reader has closed it. No `OSError`, which
-    commands take for one of their files."""
+    """Standard output cannot be written, though its reader is there. No `OSError`, which would be one of a file."""
 
 
 class TolerantStream:

@@ -70,8 +70,7 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 if the policy was written, 2 for bad input, 130 after Ctrl-C (the run is
-    saved)."""
+    """Runs the command. Exit status: 0 for a policy, 2 for bad input, 130 after Ctrl-C (the run is saved)."""
     command = common.command_line("jaxba-train", argv)
     train = functools.partial(_train, command=command)
     return common.run_command(Arguments, train, "Trains a damping policy on random scenes.", argv)

@@ -285,9 +285,8 @@ def make_game(
     envs: Sequence[int],
     options: StepOptions | None = None,
 ) -> Game:
-    """A game on `banks` of scenes of the classes `kinds`, with the rules of `config`; `envs` are the numbers of
-    environments of each class. The agent's configuration overrides the `options` of the LM step
-    (`AgentConfig.step_options`)."""
+    """A game on `banks` of scenes of the classes `kinds`, with the rules of `config` and `envs` environments of each
+    class. The agent's configuration overrides the `options` of the LM step (`AgentConfig.step_options`)."""
     options = config.agent.step_options(options or StepOptions())
     for kind in kinds:
         class_layout(kind, options)  # cached on the host before anything is traced

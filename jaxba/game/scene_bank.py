@@ -52,8 +52,7 @@ MIN_OBSERVATIONS = 30
 """Smallest number of observations of a scene that is solved at all."""
 
 MAX_ERROR_ANGLE = 0.2
-"""Largest root mean square error of a scene that is solved at all, relative to the focal length. It is larger if points
-are close to the plane of a camera."""
+"""Largest RMS error of a solved scene over the focal length; above it points are close to a camera's plane."""
 
 PAPER_ERROR_ANGLE = 1.0
 """The same for the family `paper`, whose starts are far away."""
@@ -107,8 +106,7 @@ DRAWN = 64
 
 @for_traces
 def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
-    """The random scene of a class with this number, for this key. Raises ValueError: none of `DRAWN` scenes is worth
-    solving."""
+    """A class's random scene of this number and key. Raises ValueError: none of `DRAWN` scenes is worth solving."""
     scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
     rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
     if not len(rows):
@@ -242,8 +240,7 @@ MORE_CLASSES = 2**30
 """Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (driver.py)."""
 
 HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
-"""Fraction of the usable scenes that is held out; more of them up to a number whose mean says something, but never more
-than the last fraction."""
+"""Fraction of usable scenes held out; more up to a number whose mean says something, at most the last one."""
 
 
 def held_out_count(usable: int) -> int:

@@ -155,8 +155,7 @@ def read(path: StrPath) -> BundleProblem:
 
 
 def recognised(path: StrPath, begin: bytes) -> str | None:
-    """What a file is that no reader reads, by its name and its first bytes, decompressed, as part of a message; None if
-    it may be a text of a format here."""
+    """What an unread file is, by name and first bytes, as part of a message; None if it may be of a format here."""
     place = Path(path)
     beside = any(
         (place.parent / f"{part}{place.suffix}").is_file() for part in (*PARTS, *RIG_PARTS) if part != place.stem
@@ -172,8 +171,7 @@ def recognised(path: StrPath, begin: bytes) -> str | None:
 
 
 def writer(path: StrPath) -> Writer:
-    """What writes a file of a name. Raises ProblemError: the ending is that of a format that is not written; one line
-    with the endings that are."""
+    """What writes a file of a name. Raises ProblemError: a format that is not written; names those that are."""
     known = by_ending(path)
     write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
     if write is None:

@@ -54,8 +54,7 @@ class Sidecar:
 def poses_of(poses: Poses, numbers: tuple[int, ...], calibration: Calibration) -> Float[np.ndarray, "frames 3 4"]:
     """Camera-to-world poses of this camera at the frames with these numbers.
 
-    The centre of camera 0 is at `offset` in the frame of this camera, so their paths differ. Raises ProblemError: a
-    frame has no pose."""
+    The centre of camera 0 is at `offset` in the camera's frame: paths differ. Raises ProblemError: no pose."""
     there = np.isin(numbers, poses.numbers)
     if not there.all():
         raise ProblemError(f"{poses.name}: has {len(poses.numbers)} poses, none for frame {numbers[there.argmin()]}")

@@ -48,8 +48,7 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], data: Any, path: str = "") -> T:
-    """The inverse of `plain` for a dataclass. Unknown keys are ignored. Raises ProblemError: a key is missing, or its
-    value has the wrong type."""
+    """The inverse of `plain`; ignores unknown keys. Raises ProblemError: a key is missing or of a wrong type."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)

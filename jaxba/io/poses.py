@@ -70,15 +70,13 @@ def read_poses(path: StrPath) -> Poses:
 
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
-    """Lines of a text file that are not blank, each with its number from 1. Raises ProblemError: the file cannot be
-    read, or is no text."""
+    """Lines of a file that are not blank, and their numbers from 1. Raises ProblemError: unreadable, or no text."""
     text = read_characters(path)
     return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
 def numbers_of(text: str, count: int, where: str) -> np.ndarray:
-    """The finite numbers of a line, shape (count,). Raises ProblemError: there are not so many, or one is none; the
-    message begins with `where`."""
+    """The finite numbers of a line, shape (count,). Raises ProblemError, beginning with `where`: not so many."""
     numbers = finite_numbers(text.split(), [f"number {at}" for at in range(1, len(text.split()) + 1)], where)
     if len(numbers) != count:
         raise ProblemError(f"{where}: has {len(numbers)} numbers instead of {count}")

@@ -67,8 +67,7 @@ def differentiated(
 
 
 def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Array]:
-    """The numbers of `Differentiated`. Raises NotImplementedError: there is no rule for something in the function, or
-    it is too large."""
+    """The numbers of `Differentiated`. Raises NotImplementedError: no rule for something in it, or too large."""
     over_rows = given[3].ndim - 2
     numbers = [numbers_of(x, x.ndim - over_rows) for x in given]
     function, parameters = Traced(functools.partial(_value, rows, unknowns), *numbers), numbers[:4]

@@ -75,8 +75,7 @@ class Statement(NamedTuple):
 
 
 def judge(statements: Iterable[Statement], row: Callable[[str], Row | None], where: str = "") -> tuple[Claim, ...]:
-    """Tests claims on the set of problems that is called `where`; `row` gives the row of a method by name, None if it
-    was not run."""
+    """Tests claims on the problems called `where`; `row` gives a method's row by name, None if it was not run."""
     return tuple(
         one.test(one.text.format(where), one.paper, *(row(name) for name in (one.ours, one.base) if name))
         for one in statements
@@ -154,8 +153,7 @@ def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
 
 
 def error_claim(text: str, paper: float, excess: Sequence[float]) -> Claim:
-    """The claim that an error is larger by less than `paper` on every problem; `excess` is by how much ours is larger,
-    for each."""
+    """The claim that an error is larger by less than `paper` on every problem; `excess` is how much ours is."""
     if not excess:
         return Claim(text, f"< {paper:g}", "-", "not run")
     within = sum(x < paper for x in excess)

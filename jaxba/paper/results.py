@@ -74,8 +74,7 @@ class Store:
     """The results in the folder of a run. Only one process may write at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Reads the existing results. Raises ProblemError: a file is damaged; the message names the file and the
-        line."""
+        """Reads the existing results. Raises ProblemError: a file is damaged; names the file and line."""
         self.folder = folder
         self.solves = _read(folder / SOLVES, Record)
         self.plays = _read(folder / PLAYS, Play)
@@ -139,8 +138,7 @@ class Row(NamedTuple):
 
 
 def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:
-    """The row of a method, from the outcomes on the same problems by training run; a rule has one entry, and none is
-    `trained`."""
+    """A method's row, from outcomes on the same problems by training run; a rule has one, and is not `trained`."""
     every = [outcome for solves in outcomes.values() for outcome in solves]
     if not every:
         return Row(method, *[math.nan] * 6, seeds=0, solves=0)
@@ -166,8 +164,7 @@ def of_play(play: Play) -> list[Outcome]:
 
 
 def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Outcome]:
-    """The outcomes of one method on problems, with the median time of repeats. `best` has the best known cost of each
-    problem."""
+    """A method's outcomes on problems, with the median time of repeats. `best` has each problem's best known cost."""
     found = []
     for name, runs in profile.by_problem(records).items():
         first = runs[0]

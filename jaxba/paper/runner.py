@@ -1,5 +1,4 @@
-"""Runs the solves and trainings of the tables and figures, keeps their results on disk, and makes table rows of
-them."""
+"""Runs the solves and trainings of tables and figures, keeps results on disk, and makes rows of them."""
 
 from __future__ import annotations
 
@@ -118,8 +117,7 @@ class Runner:
         return self._method(kind.name, lambda _: kind, method, linear=linear, twin=twin)
 
     def elsewhere(self, kind: Agent, method: str = "lm", *, twin: bool = False) -> Method:
-        """The same with agents trained on windows of real problems other than the one to solve. The steps of a peer are
-        those of plain LM."""
+        """The same with agents trained on windows of other real problems. A peer's steps are plain LM's."""
         library = parse_solver(method) if method.partition(":")[0] in PEERS else None
         steps = "lm" if library else method
         find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, steps)
@@ -218,8 +216,7 @@ class Runner:
 
     def solve(self, sources: Iterable[Source], methods: Sequence[Method], limit: int = LIMIT, repeats: int = 0) -> None:
         """Solves problems with methods, except for those whose results the folder has. A problem that cannot be read is
-        reported and skipped. `limit` is that of linear solves, and `repeats` the repeats of each solve; as in the
-        configuration if 0."""
+        reported and skipped. `limit` of linear solves and `repeats` are the configuration's if 0."""
         for source in sources:
             for method in methods:
                 for seed in method.numbers:

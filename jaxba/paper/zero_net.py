@@ -67,8 +67,7 @@ class ZeroNet(AgentPolicy):
 
 
 def inputs(memory: Memory) -> Float[Array, " features"]:
-    """Input of the network: last errors, last actions as log10(lambda), and last rewards, which are -1 for an iteration
-    and 0 where there was none yet."""
+    """Input of the network: last errors, actions as log10(lambda), rewards (-1 an iteration, 0 where none was yet)."""
     steps = memory.steps
     return jnp.concatenate([memory.errors, steps[:, _DAMPING], -steps[:, _PRESENT]]).astype(jnp.float32)
 

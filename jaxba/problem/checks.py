@@ -21,8 +21,7 @@ def shown(value: Any, longest: int = SHOWN) -> str:
 
 
 def plain_array(name: str, values: Any) -> np.ndarray:
-    """The values as a NumPy array. Raises ValueError: rows differ in length, or entries are masked. Raises TypeError:
-    JAX traces them."""
+    """A NumPy array. Raises ValueError: rows differ in length, or masked entries. Raises TypeError: JAX traces them."""
     if np.ma.is_masked(values):
         raise ValueError(f"{name} must have no masked entries")
     try:

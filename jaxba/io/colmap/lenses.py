@@ -1,8 +1,7 @@
 """Lenses of COLMAP as those of a problem.
 
 A model whose lenses are all of `AS_BAL` becomes a BAL problem, with pixels relative to the principal point: the
-derivatives of BAL's camera are formulas, and its blocks are small. Any other keeps its pixels, and its lenses their own
-camera models and numbers.
+derivatives of BAL's camera are formulas, and its blocks are small. Any other keeps pixels, camera models and numbers.
 """
 
 from __future__ import annotations

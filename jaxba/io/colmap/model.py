@@ -183,9 +183,8 @@ def file_name(folder: str, file: str) -> str:
 
 
 def check_model(model: Model) -> None:
-    """Refuses a model whose structure is damaged. Raises ProblemError: an id stands for none or is there twice, an
-    image names no camera or a frame no rig, a pose is not finite or has no rotation; one line that names the file
-    and the record."""
+    """Refuses a damaged structure. Raises ProblemError: an id stands for none or is there twice, an image names no
+    camera or a frame no rig, a pose is not finite or has no rotation; one line that names the file and the record."""
     rigs, frames = model.rigs or {}, model.frames or {}
     for part, records in model.records.items():
         if NO_ID in records:

@@ -141,8 +141,7 @@ def _posed(model: Model, image: Image) -> Image:
 
 
 def _registered(model: Model) -> tuple[list[Image], list[str]]:
-    """Registered images by id, with the poses of their frames, and notes on the others. Raises ProblemError: it is not
-    known where a camera is in its rig."""
+    """Registered images by id, in poses of their frames; notes on others. Raises ProblemError as `place_in_rig`."""
     images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:
         return images, []

@@ -57,8 +57,7 @@ class ForeignLens:
     """Whether radii are angles."""
 
     free: bool = True
-    """Whether f, k1 and k2 may be optimised, the last two where they are among the coefficients, if the distortion is
-    BAL's; other lenses stay as they are."""
+    """Whether f, k1 and k2, where they are coefficients, may be optimised, if the distortion is BAL's."""
 
     size: tuple[float, float] | None = None
     """Width and height of the image, pixels, if the principal point is measured from its corner."""
@@ -164,8 +163,7 @@ def checked_pose(record: Record, rotation: np.ndarray, center: list[float]) -> P
 
 
 def part(document: Record, key: str, program: str) -> Record:
-    """One of the parts of a file, which must be there and not empty. Raises ProblemError: it is not; the message says
-    what the file has."""
+    """A part of a file, which must be there and not empty. Raises ProblemError: it is not; says what there is."""
     if document.has(key) and document.value[key] not in ([], {}, ""):
         return document.get(key)
     names = ("views", "intrinsics", "extrinsics", "poses", "structure")

@@ -1,5 +1,4 @@
-"""The tables of real problems: average efficiency on KITTI and BAL, agents trained on synthetic scenes, and BAL's
-families in seconds."""
+"""Tables of real problems: efficiency on KITTI and BAL, agents of synthetic scenes, BAL's families in seconds."""
 
 from __future__ import annotations
 
@@ -20,8 +19,7 @@ TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"
 """Names of our agents, trained elsewhere."""
 
 MSE_DIFFERENCE = 0.003
-"""Largest difference of the mean squared errors of DeepLM's solver with and without ours. Source: the paper, after the
-table on BAL."""
+"""Largest difference of DeepLM's mean squared errors with and without ours. Source: the paper, after BAL's table."""
 
 
 def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
