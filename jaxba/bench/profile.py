@@ -44,8 +44,7 @@ the 31 observations of Ladybug-49 whose points are behind their cameras, as COLM
 CONVERGED = frozenset(
     {"cost", "step", "gradient", "rounding", "within", "converged", "convergence", "ftol", "xtol", "gtol"}
 )
-"""Values of `Record.termination`, in lower case, that mean converged; all others mean failed. The first five are
-members of `Termination`; other libraries write "converged" or "CONVERGENCE"."""
+"""Values of `Record.termination`, in lower case, that mean converged; the last two are of other libraries."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +160,7 @@ def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
 
 
 def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str, Reached]]:
-    """Iterations and time to a target as `table[solver][problem]`, medians over repeats. Pairs that were not run are
-    absent."""
+    """Iterations and time to a target, `table[solver][problem]`, medians over repeats, without pairs not run."""
     starts, bests = initial_costs(records), best_cost(records)
     found: dict[str, dict[str, list[Reached]]] = {}
     for r in records:

@@ -142,8 +142,7 @@ def open_folder(
 ) -> list[Record]:
     """Creates the folder, or continues a benchmark in it. Writes the settings and the command. Returns the records that
     the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, of another
-    command if that must be `alone`, or results of other problems or policies under the same names. Files are compared
-    by checksum."""
+    command if that must be `alone`, or results of other problems or policies under the same names. By checksum."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
@@ -207,9 +206,8 @@ def execute(
     """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
     A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or runs out of memory
-    on it, is reported and skipped for this problem. `done` are records of earlier runs, and `on_error` is called for
-    what is skipped. With `strict` these are also problems of which a part would be left out. Raises OSError: a result
-    cannot be written."""
+    on it, is reported and skipped for this problem. `done` are records of earlier runs; `on_error` is called for what
+    is skipped, with `strict` also problems that would lose a part. Raises OSError: a result cannot be written."""
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()
     for job in jobs:

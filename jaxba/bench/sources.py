@@ -39,8 +39,7 @@ class Source:
     """Makes the problem, where its location does not say how."""
 
     def read(self, *, strict: bool = False) -> BundleProblem:
-        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: the input is invalid;
-        the message is one line."""
+        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: one line."""
         if self.make is not None:
             return self.make()
         if not self.location.startswith(SCENE_PREFIX):

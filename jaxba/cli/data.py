@@ -22,8 +22,7 @@ class Download:
     """Folder with the families. Default: that of the data set."""
 
     checksum: bool = True
-    """Compare the checksum; else unpack the file and compare its header with its name, as for files without a known
-    checksum."""
+    """Compare the checksum; else unpack the file and compare its header with its name, as without a known one."""
 
 
 @options

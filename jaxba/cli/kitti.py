@@ -47,8 +47,7 @@ class Files:
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
 
     out: Annotated[str, "FILE"] = "kitti.txt.bz2"
-    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json beside it has the frame of
-    each camera."""
+    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz); NAME.frames.json beside it has the frames."""
 
     frames: Annotated[str, "A:B:STEP"] = ":"
     """Range of frame numbers, without the end, such as 0:200."""
@@ -290,8 +289,7 @@ def _table(title: str, first: str, *columns: str) -> Any:
 
 @contextmanager
 def _progress(console: Any) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on a terminal, otherwise a line for every stage: a function of the stage, what is done and the
-    total."""
+    """A progress bar on a terminal, else a line a stage: a function of the stage, what is done and the total."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

@@ -21,8 +21,7 @@ class TolerantStream:
     """A text stream that, once its reader has closed it, discards what is written."""
 
     def __init__(self, stream: Any, *, discard_all: bool) -> None:
-        """For standard output or error. `discard_all`: whether to do so after any other error, too, instead of raising
-        an `UnwritableStreamError`."""
+        """`discard_all`: after any other error, too, instead of raising an `UnwritableStreamError`."""
         self._stream, self._discard_all = stream, discard_all
 
     def __getattr__(self, name: str) -> Any:

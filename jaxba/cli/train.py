@@ -60,8 +60,7 @@ class Arguments:
     classes if it has none."""
 
     resume: bool = False
-    """Continue the run in the folder from its last checkpoint. The results are those of an uninterrupted run, bit for
-    bit."""
+    """Continue the run in the folder from its last checkpoint: the same results as without interruption, bit by bit."""
 
 
 def main() -> None:

@@ -260,8 +260,7 @@ class Game:
 
     @for_traces
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
-        """Uniform actions in half of the environments, Ceres' rule in a quarter, and a hundredth of its lambda in the
-        last quarter."""
+        """Uniform actions in half of the environments; Ceres' rule in a quarter, a hundredth of it in the last one."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
         rules = [jax.vmap(_rule_damping)(part.memory) for part in state.episodes]

@@ -208,10 +208,9 @@ def make_banks(
     problems: Sequence[StrPath | BundleProblem] = (),
 ) -> list[Split]:
     """Draws and solves scenes of every class, and splits the usable ones. The same key gives the same banks. `options`
-    are those of the portfolio's steps, `limit` is that of an episode; `report` is called with a line of text when
-    something begins that takes a while. The tolerance of the game does not change which scenes are usable. Windows are
-    cut from `problems`, in memory or files, instead of those that `config` names. Raises InputError: no scene of a
-    class would be left to train on."""
+    are those of the portfolio's steps, `limit` is that of an episode; `report` is called with a line when something
+    long begins. The game's tolerance does not change which are usable. Windows are cut from `problems`, in memory or
+    files, instead of those that `config` names. Raises InputError: no scene of a class would be left to train on."""
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = _shape(kind)

@@ -37,8 +37,7 @@ class Poses(NamedTuple):
 
 
 def read_poses(path: StrPath) -> Poses:
-    """Poses of camera 0, camera to world, in metres. Raises ProblemError: the file cannot be read, a line is malformed
-    or holds no rotation, or a frame comes twice."""
+    """Poses of camera 0 to world, metres. Raises ProblemError: unreadable, malformed, no rotation, or a frame twice."""
     name = display_name(path)
     lines = lines_of(Path(path))
     if not lines:

@@ -104,8 +104,7 @@ class Tolerances(NamedTuple):
 
 
 def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:
-    """How far a cost is above the one at which the solve would end, relative to it: an estimate that is seldom too
-    small, infinite after a rejected or shortened step.
+    """Relative distance of a cost to that of the end, seldom too small; infinite after a rejected or shortened step.
 
     What is left to do after a step is what damping kept it from doing. Where damping has no share of it (the fraction
     is zero), next steps decrease the cost by far less than this one; in a flat valley, where it has, by as much for

@@ -119,8 +119,7 @@ def _weighted(
     own: Numbers,
     by_point: Numbers,
 ) -> list[Array]:
-    """The numbers of `Differentiated`, for the derivatives of residuals by rotation matrices, translations and numbers
-    of cameras, and by points."""
+    """The numbers of `Differentiated`, for derivatives by rotations, translations, numbers of cameras, points."""
     # R <- R + [w]x R changes the residual by w . sum of R_j x dr/dR_j over columns j
     turn = _cross(given[0], turn, -2).sum(axis=-1)
     if unknowns.in_rigs:  # R = M R_f and t = M t_f + m, with steps of frames and of M and m

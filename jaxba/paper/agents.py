@@ -100,8 +100,7 @@ def with_state_size(size: int) -> Agent:
 
 
 def train_config(config: PaperConfig, agent: Agent) -> TrainConfig:
-    """Configuration of the training of an agent: all training runs side by side, on the scenes of the paper's game.
-    Raises SettingsError: an override is invalid."""
+    """Configuration of an agent's training runs on the paper's game. Raises SettingsError: an invalid override."""
     changes = (*config.agents.overrides, *agent.overrides, f"seeds={config.agents.seeds}", f"seed={config.seed}")
     found = train_configs.load(agent.preset, changes)
     bank = train_configs.load(OURS.preset, changes).bank

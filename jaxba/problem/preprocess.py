@@ -82,8 +82,7 @@ def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:
-    """The same scene translated by an offset, scene units; all residuals are unchanged. Cameras and points without
-    observations are not moved."""
+    """The same scene translated by an offset, scene units, but for cameras and points without observations."""
     if not np.any(offset):
         return problem
     return transformed(problem, Similarity(1.0, np.eye(3), offset), *observed(problem))
@@ -100,8 +99,7 @@ def perturb(
     not finite. Source: Ceres `BALProblem::Perturb`.
 
     As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held fixed, then translation
-    noise is added to `t = -R c`. rootba adds it to the centre c, which has the same distribution, since the noise is
-    isotropic.
+    noise is added to `t = -R c`. rootba adds it to c: the same distribution.
 
     Args:
         problem: the problem to perturb.

@@ -13,8 +13,7 @@ Two cases do not come back by themselves, since the cost does not see them:
   vanishes, or send it through infinity behind its cameras. So neither the step nor the point's own iterations may
   increase its distance more than `MAX_DISTANCE_RATIO` times.
 
-Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment" (embedded point iterations);
-Ceres calls the same idea inner iterations.
+Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment"; Ceres' inner iterations.
 """
 
 from __future__ import annotations

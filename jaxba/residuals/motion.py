@@ -106,8 +106,7 @@ def _exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def _integrated(samples: Float[Array, "n 6"], steps: Float[Array, " n"]) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Nine numbers with the derivatives of the rotation, by a small rotation after it, of velocity and of position;
-    and these (Forster et al. 2017, eq. 33)."""
+    """Nine numbers, with derivatives of rotation (by one after it), velocity and position (Forster et al., eq. 33)."""
 
     def advance(state: tuple[Array, Array, Array], of: tuple[Array, Array]) -> tuple[tuple[Array, Array, Array], None]:
         (rotation, velocity, position), (sample, dt) = state, of

@@ -1,7 +1,6 @@
 """Checkpoints: a tree of arrays and JSON metadata in one `.npz` file, written atomically.
 
-A tree is stored as a flat mapping from paths to NumPy arrays; every leaf that is restored must have the expected shape
-and type.
+A tree is a flat mapping from paths to NumPy arrays; restored leaves must have the expected shape and type.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ _METADATA = "metadata"
 
 
 class TrainError(InputError):
-    """A run that cannot start or continue, or a checkpoint that cannot be used. The message is one line for a
-    person."""
+    """A run that cannot start or continue, or an unusable checkpoint. The message is one line for a person."""
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
@@ -73,8 +71,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, in their order in the file. Raises TrainError: the file is damaged. Raises OSError:
-    it cannot be opened."""
+    """All arrays of an `.npz` file, in its order. Raises TrainError: it is damaged. Raises OSError: not opened."""
     with path.open("rb") as stream:
         try:
             with np.load(stream) as file:

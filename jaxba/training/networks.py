@@ -45,8 +45,7 @@ class MLP(nn.Module):
     layer_norm: bool = False
     """Whether each hidden layer is normalised before its ReLU. Source: Ba et al. 2016; in critics Ball et al. 2023.
 
-    Without learned scale and shift, which the layers around it can provide: an update of width 64 takes a tenth less
-    time.
+    Without learned scale and shift, which the next layers have: an update of width 64 takes a tenth less time.
     """
 
     @nn.compact

@@ -150,10 +150,9 @@ def build(
     on_game: Callable[[Game], Any] = lambda _: None,
 ) -> Task:
     """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. `report` is called with a
-    line of text when something begins that takes a while; `baselines` are names to compare with, unless the folder has
-    their results already; `BASELINES` if None; `on_game` is called with the game before they are played. Raises
-    ValueError: too few scenes are usable, or another version wrote the files; one line for a person. Raises OSError:
-    the folder cannot be written or read."""
+    line when something long begins; `baselines` are names to compare with, unless the folder has results; `BASELINES`
+    if None; `on_game` is called with the game first. Raises ValueError: too few scenes are usable, or another version
+    wrote the files; one line for a person. Raises OSError: the folder cannot be written or read."""
     splits = _splits(config, folder, report)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)

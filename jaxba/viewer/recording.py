@@ -132,8 +132,7 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 
 
 def write_recording(recording: Recording, path: StrPath) -> None:
-    """Writes a recording, whole or not at all. Points are float32, relative to their middle. Raises ProblemError: it
-    cannot be written."""
+    """Writes a recording, whole or not at all; points are float32 from their middle. Raises ProblemError."""
     problem, lenses = recording.problem, recording.problem.lenses
     middle = np.median(recording.points[-1], axis=0)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}

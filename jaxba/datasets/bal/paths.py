@@ -95,8 +95,7 @@ def downloaded_path(entry: Entry) -> Path | None:
 
 
 def local_path(name: str) -> Path:
-    """Path of the downloaded problem of a name. Raises ProblemError: there is no problem of that name, or it has not
-    been downloaded; one line that says how to."""
+    """Path of a downloaded problem. Raises ProblemError: no such problem, or not downloaded; says how to."""
     found = next((entry for entry in ENTRIES if entry.name == name.lower()), None)
     if found is None:
         raise ProblemError(_unknown(name))

@@ -47,8 +47,7 @@ def lenses_of(
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
-    """A camera with new numbers, which are BAL's if `bal`, where its model has them; all else stays as it is, bit by
-    bit."""
+    """A camera with new numbers, which are BAL's if `bal`, where its model has them; the rest stays, bit by bit."""
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
     names = CAMERA_MODELS[camera.model].parameters
