@@ -44,7 +44,7 @@ the 31 observations of Ladybug-49 whose points are behind their cameras, as COLM
 CONVERGED = frozenset(
     {"cost", "step", "gradient", "rounding", "within", "converged", "convergence", "ftol", "xtol", "gtol"}
 )
-"""Values of `Record.termination`, in lower case, that mean converged; the last two are of other libraries."""
+"""Values of `Record.termination`, in lower case, that mean converged; the first five are those of `Termination`."""
 
 
 @dataclass(frozen=True)

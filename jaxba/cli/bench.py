@@ -87,12 +87,10 @@ def _bench(args: Arguments, command: str) -> int:
     solvers = [name for name in (args.solvers or DEFAULT_SOLVERS).split(",") if name.strip()]
     tolerance = 1e-3 if args.tolerance is None else float(args.tolerance)
     repeats = 3 if args.repeats is None else args.repeats
-    if not 0 < tolerance < 1:
-        raise common.UsageError(f"--tolerance must lie between 0 and 1, is {tolerance:g}")
+    common.require(0 < tolerance < 1, f"--tolerance must lie between 0 and 1, is {tolerance:g}")
     max_iterations = 100 if args.max_iterations is None else args.max_iterations
     common.check_positive(repeats=repeats, max_iterations=max_iterations)
-    if not solvers:
-        raise common.UsageError("--solvers names no solver")
+    common.require(bool(solvers), "--solvers names no solver")
     from jaxba.bench import run
     from jaxba.bench.sources import SCENE_PREFIX, sources
     from jaxba.scenes import DEFAULT_SCENES
@@ -108,7 +106,6 @@ def _bench(args: Arguments, command: str) -> int:
 
 
 def _open(args: Arguments, jobs: Any, settings: Any, command: str) -> tuple[Path, Any]:
-    """The folder of the results, and the records in it."""
     from jaxba.bench import run
     from jaxba.problem.bundle_problem import ProblemError
 
@@ -199,12 +196,8 @@ def _line(problem: str, records: Any) -> str:
 class Suite:
     """Content of a suite file; the command line replaces what it gives, by the options of the same names."""
 
-    problems: tuple[str, ...] = ()
-    """Names or paths, in which $VARIABLES and wildcards are expanded."""
-
-    solvers: tuple[str, ...] | None = None
-    """Names of solvers."""
-
+    problems: tuple[str, ...] = ()  # names or paths, in which $VARIABLES and wildcards are expanded
+    solvers: tuple[str, ...] | None = None  # names of solvers
     tolerance: float | None = None
     repeats: int | None = None
     max_iterations: int | None = None
@@ -237,14 +230,11 @@ def _with_suite(args: Arguments) -> Arguments:
 def _expand(args: Arguments, entry: str) -> list[str]:
     """The names or paths for an entry of a suite's problems, with variables and wildcards expanded."""
     for name in _VARIABLE.findall(entry):
-        if not os.environ.get(name):
-            raise common.UsageError(
-                f"--suite {args.suite}: {entry}: the environment variable {name}, a folder of problems, is not set"
-            )
+        unset = f"{entry}: the environment variable {name}, a folder of problems, is not set"
+        common.require(bool(os.environ.get(name)), f"--suite {args.suite}: {unset}")
     expanded = os.path.expandvars(entry)
     if not glob.has_magic(expanded):
         return [expanded]
     found = sorted(glob.glob(expanded))
-    if not found:
-        raise common.UsageError(f"--suite {args.suite}: {expanded}: no such file")
+    common.require(bool(found), f"--suite {args.suite}: {expanded}: no such file")
     return found

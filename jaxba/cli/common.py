@@ -78,7 +78,6 @@ def command_line(name: str, argv: Sequence[str] | None) -> str:
 
 
 def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> int:
-    """Runs a command with what `parse` has found."""
     if parsed is None:
         return 0
     if isinstance(parsed, str):
@@ -221,33 +220,27 @@ def check_writable(option: str, path: str | None) -> None:
     if path is None or path.startswith(STREAMS):
         return
     target = Path(os.path.realpath(path))  # a symbolic link is kept, and its target is written
-    if target.is_dir():
-        raise UsageError(f"{option} {path}: is a directory")
-    if path.endswith(tuple(filter(None, (os.sep, os.altsep)))):
-        raise UsageError(f"{option} {path}: is the name of a directory, not of a file")
+    require(not target.is_dir(), f"{option} {path}: is a directory")
+    separators = tuple(filter(None, (os.sep, os.altsep)))
+    require(not path.endswith(separators), f"{option} {path}: is the name of a directory, not of a file")
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is written directly
-        if not os.access(path, os.W_OK):
-            raise UsageError(f"{option} {path}: cannot be written")
+        require(os.access(path, os.W_OK), f"{option} {path}: cannot be written")
         return
     folder = target.parent if Path(path).is_symlink() else Path(path).parent
-    if not target.parent.is_dir():
-        raise UsageError(f"{option} {path}: folder {folder} does not exist")
-    if not os.access(target.parent, os.W_OK):
-        raise UsageError(f"{option} {path}: folder {folder} cannot be written")
-    if target.exists() and not target.stat().st_mode & _WRITABLE:
-        raise UsageError(f"{option} {path}: is a read-only file")
+    require(target.parent.is_dir(), f"{option} {path}: folder {folder} does not exist")
+    require(os.access(target.parent, os.W_OK), f"{option} {path}: folder {folder} cannot be written")
+    read_only = target.exists() and not target.stat().st_mode & _WRITABLE
+    require(not read_only, f"{option} {path}: is a read-only file")
 
 
 def check_folder(option: str, path: str) -> None:
     """Checks that an output folder can be created or written, before any work is done. Raises UsageError: it is a file
     or not writable, or it does not exist and its parent is missing or not writable."""
     target = Path(path).absolute()
-    if target.exists() and not target.is_dir():
-        raise UsageError(f"{option} {path}: is a file, not a folder")
     if not target.exists():
-        check_writable(option, str(Path(path)))  # without a trailing separator
-    elif not os.access(target, os.W_OK):
-        raise UsageError(f"{option} {path}: folder cannot be written")
+        return check_writable(option, str(Path(path)))  # without a trailing separator
+    require(target.is_dir(), f"{option} {path}: is a file, not a folder")
+    require(os.access(target, os.W_OK), f"{option} {path}: folder cannot be written")
 
 
 def check_positive(**values: Any) -> None:
@@ -258,9 +251,8 @@ def check_positive(**values: Any) -> None:
     for name, value in values.items():
         option = "--" + name.replace("_", "-")
         if name.endswith("tol"):
-            if not value >= 0:
-                raise UsageError(f"{option} must not be negative, is {value:g}")
-        elif not value > 0:
-            raise UsageError(f"{option} must be positive, is {value:g}")
-        elif isinstance(value, int) and value > LARGEST_COUNT:
-            raise UsageError(f"{option} must be at most {LARGEST_COUNT}, is {value}")
+            require(value >= 0, f"{option} must not be negative, is {value:g}")
+            continue
+        require(value > 0, f"{option} must be positive, is {value:g}")
+        too_large = isinstance(value, int) and value > LARGEST_COUNT
+        require(not too_large, f"{option} must be at most {LARGEST_COUNT}, is {value}")

@@ -97,8 +97,7 @@ def _download(args: Download) -> int:
 
     from jaxba.datasets.bal.paths import data_folder, select
 
-    if not args.names:
-        raise common.UsageError("name a problem or a family; jaxba-data list shows them")
+    common.require(bool(args.names), "name a problem or a family; jaxba-data list shows them")
     entries, folder = select(args.names), data_folder()
     common.check_extra("jaxba.datasets.bal.download")
     from jaxba.datasets.bal import download

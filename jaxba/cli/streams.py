@@ -48,7 +48,8 @@ class TolerantStream:
         try:
             yield
         except OSError as error:
-            discard(self._stream)
+            with suppress(OSError, ValueError):  # a stream without a file; what it has buffered is discarded, too
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
             if not (self._discard_all or isinstance(error, BrokenPipeError)):
                 raise UnwritableStreamError(f"standard output: {error.strerror or error}") from None
 
@@ -63,12 +64,6 @@ def whole_input() -> str:
             os.dup2(copy.fileno(), 0)
         os.lseek(0, 0, os.SEEK_SET)
     return "/dev/stdin"
-
-
-def discard(stream: Any) -> None:
-    """Redirects a stream, including what it has buffered, to the null device."""
-    with suppress(OSError, ValueError):  # a stream without a file
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextmanager

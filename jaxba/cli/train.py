@@ -75,13 +75,6 @@ def run(argv: Sequence[str] | None = None) -> int:
     return common.run_command(Arguments, train, "Trains a damping policy on random scenes.", argv)
 
 
-def _train(args: Arguments, command: str) -> int:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
-    return _run(args, command)
-
-
 def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     """The configuration of the run, and its folder."""
     from jaxba.cli.overwriting import check_apart
@@ -92,8 +85,8 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     overrides = tuple(item for group in args.overrides for item in group)
     overrides += () if args.seeds is None else (f"seeds={args.seeds}",)
     config = None if args.resume and args.config is None else configs.load(name, overrides)
-    if args.problems and config is None:
-        raise common.UsageError("--problems: a resumed run has its scenes in its folder")
+    resumed = args.problems and config is None
+    common.require(not resumed, "--problems: a resumed run has its scenes in its folder")
     if args.problems and config is not None:
         config = configs.with_problems(config, _check_problems(args.problems))
     if config is not None and not args.resume:  # the configuration of a run that goes on is its own
@@ -102,10 +95,13 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     return driver.prepare_folder(folder, config, args.resume, overrides)
 
 
-def _run(args: Arguments, command: str) -> int:
+def _train(args: Arguments, command: str) -> int:
+    import jax
+
     from jaxba.runtime import process
     from jaxba.training import driver, task, view
 
+    jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
     config = _prepare(args, folder, name)

@@ -25,20 +25,11 @@ Writer = Callable[[BundleProblem, StrPath], None]
 class Format:
     """A format of single files."""
 
-    name: str
-    """What messages call it."""
-
-    endings: tuple[str, ...]
-    """Lower-case endings of its files, without that of compression; the first is the one to recommend."""
-
-    read: Reader | None = None
-    """Reader; None if it is only written."""
-
-    write: Writer | None = None
-    """Writer; None if it is only read."""
-
-    begins: tuple[bytes, ...] = ()
-    """First bytes of its files after blanks, by which a file without a known ending is recognised."""
+    name: str  # what messages call it
+    endings: tuple[str, ...]  # of its files, lower case, without compression; the first is the one to recommend
+    read: Reader | None = None  # reader; None if it is only written
+    write: Writer | None = None  # writer; None if it is only read
+    begins: tuple[bytes, ...] = ()  # first bytes after blanks, by which a file without a known ending is recognised
 
 
 def _read_nvm(path: StrPath) -> BundleProblem:
@@ -179,12 +170,6 @@ def writer(path: StrPath) -> Writer:
         name = display_name(path)
         raise ProblemError(f"cannot write {name}: files{of} with {ending(path)} are not written; {formats_written()}")
     return write
-
-
-def holds_bal_only(path: StrPath) -> bool:
-    """Whether a file of this name holds cameras of BAL only."""
-    known = by_ending(path)
-    return known is None or known.name != "PLY"
 
 
 def holds_problem(path: StrPath) -> bool:

@@ -105,8 +105,6 @@ class Runner:
         """Number of solves, plays and trainings that this process has done."""
         self._read: tuple[Source, BundleProblem] | None = None
 
-    # Policies
-
     def agent(
         self, kind: Agent, linear: LinearSolverChoice = "auto", method: str = "lm", *, twin: bool = False
     ) -> Method:
@@ -176,8 +174,6 @@ class Runner:
             zero_net.save(path, net)
             self.done += 1
         return net, SolveOptions()
-
-    # Work
 
     @functools.cached_property
     def test_scenes(self) -> Bank:
@@ -260,8 +256,6 @@ class Runner:
         self.store.add_solve(replace(record, solver=method.label(seed)))
         self.done += 1
 
-    # Rows
-
     def row_on_scenes(self, method: Method) -> Row:
         """The row of a method on the scenes of the tables, from the results so far."""
         plays = [self.store.play(TEST, method.name, seed) for seed in method.numbers]
@@ -294,7 +288,3 @@ class Runner:
         """First lambdas on every scene of the tables, of the method's first training run."""
         known = self.store.play(TEST, method.name, 0)
         return [] if known is None else list(known.first)
-
-    def number_of_scenes(self) -> int:
-        """Number of scenes of the tables, from the results so far."""
-        return max((len(p.iterations) for p in self.store.plays if p.scenes == TEST), default=0)

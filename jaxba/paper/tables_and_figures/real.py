@@ -38,9 +38,6 @@ def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
     )
 
 
-# Average efficiency on KITTI
-
-
 def _kitti(runner: Runner) -> list[Part]:
     """Source: the paper, table "Average efficiency improvement - KITTI"."""
     lines = [
@@ -71,9 +68,6 @@ def _kitti_text(runner: Runner) -> str:
         "As in the paper, poses and points are unknown and the lens is known. "
         + _trained_elsewhere(runner, real_problems.find(runner.config.real.kitti).sources)
     )
-
-
-# Average efficiency on BAL
 
 
 def _bal(runner: Runner) -> list[Part]:
@@ -117,9 +111,6 @@ def _same_error(runner: Runner) -> Iterable[claims.Claim]:
     yield claims.error_claim("BAL: ours does not change DeepLM's mean squared error", MSE_DIFFERENCE, excess)
 
 
-# Trained on synthetic scenes
-
-
 def _synthetic(runner: Runner) -> list[Part]:
     """Source: the paper, tables "Average efficiency improvement" and "Average acceleration using synthetic data for
     training"."""
@@ -159,8 +150,6 @@ def _synthetic_text(runner: Runner) -> str:
         "its cameras, those of KITTI with known lenses."
     )
 
-
-# BAL's families against Ceres with conjugate gradients, in seconds
 
 FAMILY_SECONDS = {
     "Trafalgar": (65.1, 10.2, 5.6),
