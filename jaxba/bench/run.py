@@ -44,14 +44,9 @@ SETTINGS = "settings.json"
 class RunSettings:
     """Settings shared by all runs of a benchmark."""
 
-    max_iterations: int = MAX_ITERATIONS
-    """Limit of linear solves."""
-
-    linear_solver: str = "auto"
-    """`auto`, `explicit`, `sparse` or `implicit`. Applies to the method `lm`; others have their own solver."""
-
-    pad: bool = False
-    """Whether problems are padded, so that those of one capacity share compiled programs."""
+    max_iterations: int = MAX_ITERATIONS  # limit of linear solves
+    linear_solver: str = "auto"  # of the method `lm`; others have their own
+    pad: bool = False  # whether problems are padded, so that those of one capacity share compiled programs
 
 
 @dataclass(frozen=True)

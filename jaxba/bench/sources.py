@@ -26,17 +26,10 @@ _GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)
 class Source:
     """A named problem that has not been read yet."""
 
-    name: str
-    """Unique within a benchmark."""
-
-    family: str
-    """Name of the folder of a file; `scene` for a random scene."""
-
-    location: str
-    """Path, or `scene:NAME:SEED`."""
-
-    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)
-    """Makes the problem, where its location does not say how."""
+    name: str  # unique within a benchmark
+    family: str  # name of the folder of a file; `scene` for a random scene
+    location: str  # path, or `scene:NAME:SEED`
+    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)  # where its location does not say how
 
     def read(self, *, strict: bool = False) -> BundleProblem:
         """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: one line."""

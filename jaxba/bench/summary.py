@@ -92,8 +92,7 @@ class Summary:
     solvers: list[SolverSummary]
     cells: list[Cell]
     warnings: list[str]
-    metadata: dict[str, Any] = field(default_factory=dict)
-    """Device, threads, versions and the like."""
+    metadata: dict[str, Any] = field(default_factory=dict)  # device, threads, versions and the like
 
 
 def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapping[str, Any] | None = None) -> Summary:

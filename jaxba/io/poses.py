@@ -23,17 +23,10 @@ from jaxba.problem.geometry import are_rotations
 class Poses(NamedTuple):
     """Camera-to-world poses of frames."""
 
-    numbers: Int[np.ndarray, " frames"]
-    """Number of each frame, ascending."""
-
-    matrices: Float[np.ndarray, "frames 3 4"]
-    """`[R | c]` of each, metres."""
-
-    name: str
-    """Of the file, for messages."""
-
-    one_a_line: bool = True
-    """Whether the lines of the file are the frames, so that none can be missing before the last."""
+    numbers: Int[np.ndarray, " frames"]  # number of each frame, ascending
+    matrices: Float[np.ndarray, "frames 3 4"]  # `[R | c]` of each, metres
+    name: str  # of the file, for messages
+    one_a_line: bool = True  # whether lines are frames, so that none can be missing before the last
 
 
 def read_poses(path: StrPath) -> Poses:

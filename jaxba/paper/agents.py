@@ -42,20 +42,11 @@ BASELINES = ("ceres",)
 class Agent:
     """One kind of agent."""
 
-    name: str
-    """Name in records and folders."""
-
-    preset: str = "paper-tuned"
-    """Of `jaxba-train`."""
-
-    overrides: tuple[str, ...] = ()
-    """Settings (`key=value`) that differ from the preset."""
-
-    few_scenes: bool = False
-    """Whether it is trained on as few scenes as the paper's agent."""
-
-    problems: tuple[str, ...] = ()
-    """Files of real problems, on windows of which it is trained; on the synthetic scenes if empty."""
+    name: str  # in records and folders
+    preset: str = "paper-tuned"  # of `jaxba-train`
+    overrides: tuple[str, ...] = ()  # settings (`key=value`) that differ from the preset
+    few_scenes: bool = False  # whether it is trained on as few scenes as the paper's agent
+    problems: tuple[str, ...] = ()  # files of real problems, on windows of which it is trained, if any
 
 
 OURS = Agent("agent")

@@ -58,20 +58,11 @@ class Claim(NamedTuple):
 class Statement(NamedTuple):
     """A claim before it is tested: the rule, the claim in words, the paper's number, and the methods."""
 
-    test: Callable[..., Claim]
-    """`ratio_claim`, `time_claim`, `longer_claim`, `order_claim` or `success_claim`."""
-
-    text: str
-    """In words; `{}` stands for the set of problems."""
-
-    paper: Any
-    """The paper's number, as the test takes it."""
-
-    ours: str
-    """Method that the claim is about."""
-
-    base: str = ""
-    """Method that it is compared with; none for `success_claim`."""
+    test: Callable[..., Claim]  # a function of this module such as `ratio_claim`
+    text: str  # in words; `{}` stands for the set of problems
+    paper: Any  # the paper's number, as the test takes it
+    ours: str  # method that the claim is about
+    base: str = ""  # method that it is compared with; none for `success_claim`
 
 
 def judge(statements: Iterable[Statement], row: Callable[[str], Row | None], where: str = "") -> tuple[Claim, ...]:

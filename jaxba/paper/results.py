@@ -37,32 +37,15 @@ to a worse cost needs few iterations without being better."""
 class Play:
     """Solves of all scenes of a set with one policy. Tuples have an entry for each scene."""
 
-    scenes: str
-    """Name of the set of scenes."""
-
-    method: str
-    """Name of the policy."""
-
-    seed: int
-    """Number of the training run, from 0; 0 for rules."""
-
-    iterations: tuple[int, ...]
-    """Linear solves."""
-
-    converged: tuple[bool, ...]
-    """Whether the solve converged before the limit of iterations."""
-
-    near: tuple[float, ...]
-    """Linear solves until the cost is within `NEAR` of the best known cost; infinite (null in the file) if never."""
-
-    end: tuple[float, ...]
-    """Final cost relative to the best known cost, minus 1."""
-
-    first: tuple[tuple[float, ...], ...]
-    """First lambdas of each solve."""
-
-    seconds: float
-    """Time for all scenes together, including compilation, and so not a measure of speed."""
+    scenes: str  # name of the set of scenes
+    method: str  # name of the policy
+    seed: int  # number of the training run, from 0; 0 for rules
+    iterations: tuple[int, ...]  # linear solves
+    converged: tuple[bool, ...]  # whether the solve converged before the limit of iterations
+    near: tuple[float, ...]  # linear solves until the cost is within `NEAR` of the best known; infinite (null) if never
+    end: tuple[float, ...]  # final cost relative to the best known cost, minus 1
+    first: tuple[tuple[float, ...], ...]  # first lambdas of each solve
+    seconds: float  # for all scenes, with compilation, and so no measure of speed
 
     def __post_init__(self) -> None:
         for name in ("near", "end"):  # null in the file is read as NaN

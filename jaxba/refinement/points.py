@@ -61,14 +61,9 @@ class PreviousPoints(NamedTuple):
 
     points: Float[Array, "3 points"]
 
-    front: Bool[Array, " slots"]
-    """Whether the point was in front of the camera."""
-
-    inverse_depth_sum: Float[Array, " points"]
-    """Sum over the cameras of a point, negative in front of them."""
-
-    costs: Float[Array, " points"]
-    """Cost of the observations of each point, pixels^2."""
+    front: Bool[Array, " slots"]  # whether the point was in front of the camera
+    inverse_depth_sum: Float[Array, " points"]  # sum over the cameras of a point, negative in front of them
+    costs: Float[Array, " points"]  # cost of the observations of each point, pixels^2
 
     @classmethod
     def of(cls, layout: Layout, points: Float[Array, "3 points"], reference: Reference) -> PreviousPoints:

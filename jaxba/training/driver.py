@@ -69,20 +69,11 @@ def best_of(policies: Sequence[Best]) -> Best:
 class Hooks:
     """Callbacks of a run."""
 
-    stage: Callable[[str], None] = lambda _: None
-    """Called with a line of text when something begins that takes a while."""
-
-    rows: Callable[[list[Row]], None] = lambda _: None
-    """Called after each chunk with its rows of the log, one of every agent."""
-
-    best: Callable[[tuple[Best, ...]], None] = lambda _: None
-    """Called with the best policies of all agents whenever one of them is new."""
-
-    stop: Callable[[], bool] = lambda: False
-    """Called after each chunk; if it returns true, the run is saved and ends."""
-
-    note: Callable[[str], None] = lambda _: None
-    """Called with a line of text on damaged files."""
+    stage: Callable[[str], None] = lambda _: None  # gets a line of text when something long begins
+    rows: Callable[[list[Row]], None] = lambda _: None  # gets the rows of a chunk, one of every agent
+    best: Callable[[tuple[Best, ...]], None] = lambda _: None  # gets the best policies of all agents when one is new
+    stop: Callable[[], bool] = lambda: False  # asked after each chunk: if true, the run is saved and ends
+    note: Callable[[str], None] = lambda _: None  # gets a line of text on damaged files
 
 
 def prepare_folder(

@@ -26,14 +26,11 @@ FOLDER_VARIABLE = "JAXBA_BAL"
 class Entry(NamedTuple):
     """One file of the data set."""
 
-    family: str
-    """ladybug, trafalgar, dubrovnik, venice or final; the folder of the file."""
-
+    family: str  # ladybug, trafalgar, dubrovnik, venice or final; the folder of the file
     cameras: int
     points: int
 
-    sha256: str | None
-    """Checksum of the compressed file in hexadecimal digits; None where none is published."""
+    sha256: str | None  # of the compressed file, hexadecimal; None where none is published
 
     @property
     def name(self) -> str:

@@ -23,15 +23,10 @@ class Ordered(NamedTuple):
 
     model: Model
     images: list[Image]
-    keys: Shaped[np.ndarray, " keys"]
-    """Key-points of these images, one image after the other."""
-
-    first_key: Int[np.ndarray, " images+1"]
-    """Position of the first key-point of each image, and their number."""
-
+    keys: Shaped[np.ndarray, " keys"]  # key-points of these images, one image after the other
+    first_key: Int[np.ndarray, " images+1"]  # position of the first key-point of each image, and their number
     points: Shaped[np.ndarray, " points"]
-    order: Int[np.ndarray, " points"]
-    """Positions of the points in their file."""
+    order: Int[np.ndarray, " points"]  # positions of the points in their file
 
     def key_name(self, key: int) -> str:
         """A key-point for messages, by its position."""
