@@ -31,8 +31,7 @@ RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
 """Values of epsilon in the target `f <= f*(1 + epsilon)`."""
 
 ZERO_RESIDUAL_FLOOR = 1e-12
-"""Costs up to f* plus this times f0 satisfy every relative tolerance. Without it, a problem whose best cost is rounding
-error (f* ~ 1e-26) would demand the same rounding error of every solver."""
+"""Costs up to f* plus this times f0 satisfy every relative tolerance, since f* may be rounding error (1e-26)."""
 
 INITIAL_COST_TOLERANCE = 1e-2
 """Relative difference of initial costs above which two solvers had different starts. Source: rootba."""

@@ -120,16 +120,12 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     for solver in parsed:
         require(solver)
         if not solver.peer:
-            _check_options(solver)
+            policy, options = solver.build()
+            try:
+                options.step_options(policy)
+            except ValueError as error:
+                raise InputError(f"{error} (in {str(solver)!r})") from None
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
-
-
-def _check_options(solver: SolverName) -> None:
-    policy, options = solver.build()
-    try:
-        options.step_options(policy)
-    except ValueError as error:
-        raise InputError(f"{error} (in {str(solver)!r})") from None
 
 
 def open_folder(
@@ -137,7 +133,7 @@ def open_folder(
 ) -> list[Record]:
     """Creates the folder, or continues a benchmark in it. Writes the settings and the command. Returns the records that
     the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, of another
-    command if that must be `alone`, or results of other problems or policies under the same names. By checksum."""
+    command if that must be `alone`, or results of other problems or policies (by checksum) under the same names."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)

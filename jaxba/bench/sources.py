@@ -47,6 +47,7 @@ def sources(locations: list[str]) -> list[Source]:
     or names of downloaded BAL problems such as ladybug-49, if there is no file of that name; duplicates count once.
     Raises ProblemError: a missing file or an unknown scene; the message is one line."""
     found: list[Source] = []
+    place = lambda one: one if one.startswith(SCENE_PREFIX) else Path(one).resolve()
     for location in locations:
         if location.startswith(SCENE_PREFIX):
             name, seed = _scene(location)
@@ -66,7 +67,7 @@ def sources(locations: list[str]) -> list[Source]:
                 label = _model_name(path)
             # reports and figures cannot show bytes that are not valid text
             label, family = display_name(label), display_name(path.resolve().parent.name)
-        if any(_same(source.location, location) for source in found):
+        if place(location) in [place(source.location) for source in found]:
             continue
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:
@@ -77,12 +78,6 @@ def sources(locations: list[str]) -> list[Source]:
             unique = f"{label}-{count}"
         found.append(Source(unique, family, location))
     return found
-
-
-def _same(one: str, other: str) -> bool:
-    if one.startswith(SCENE_PREFIX) or other.startswith(SCENE_PREFIX):
-        return one == other
-    return Path(one).resolve() == Path(other).resolve()
 
 
 def _model_name(folder: Path) -> str:

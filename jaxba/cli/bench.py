@@ -185,7 +185,6 @@ def _run_missing(
 
 
 def _line(problem: str, records: Any) -> str:
-    """What was done on a problem."""
     seconds = sum(one.setup_s + one.compile_s + one.total_s for one in records)
     compiled, cost = sum(one.compile_s for one in records), min(one.final_cost for one in records)
     runs = common.counted(len(records), "run")
@@ -204,7 +203,6 @@ class Suite:
 
 
 def _with_suite(args: Arguments) -> Arguments:
-    """The arguments, completed by those of the suite."""
     if args.suite is None:
         return args
     from jaxba import settings

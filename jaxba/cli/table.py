@@ -60,7 +60,6 @@ def _lenses(problem: BundleProblem, options: StepOptions) -> Iterator[str]:
 
 
 def _constants(problem: BundleProblem) -> list[str]:
-    """What of poses and points is constant."""
     if problem.constants is None:
         return []
     poses = np.asarray(problem.constants.poses)

@@ -126,8 +126,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
     """The first devices of every process, in the order of the processes.
 
     A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked for. `count` is
-    that of each process; None: one, or all that there are if there are several processes. Raises InputError: a process
-    has fewer."""
+    that of each process; None: one, or all with several processes. Raises InputError: a process has fewer."""
     if count is not None:
         count = int(count)
         if count < 1:

@@ -48,8 +48,7 @@ class Interrupt:
 
     def __init__(self, unit: str = "", *, graceful: bool = False) -> None:
         """Does nothing yet. `unit` is what is finished after the first signal, for the message, e.g. `iteration`.
-        Without it, signals that have a handler already are left alone. `graceful` is the initial value of the
-        attribute, which can be changed later."""
+        Without it, signals that have a handler already are left alone. `graceful` can be changed later."""
         self.unit, self.graceful, self.requested = unit, graceful, False
         # signals that the thread and the handler have seen; Python calls the handler once for several signals
         self._received, self._handled = 0, 0

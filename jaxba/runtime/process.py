@@ -50,8 +50,7 @@ def keep_memory() -> bool:
     That holds for glibc's main arena, the one of the process's first thread; the arena of another thread holds 64 MiB
     and is returned when it empties. So XLA is set to run programs in the thread that calls them, which must be done
     before any program runs. (A single arena for all threads would do as well, but threads that compile would wait for
-    each other: 7.8 s instead of 4.9 s for the step of `bold` on Ladybug-49.) Returns whether it took effect; false
-    where the C library is another one."""
+    each other: 7.8 s instead of 4.9 s for the step of `bold` on Ladybug-49.) Returns whether it took effect."""
     if not sys.platform.startswith("linux"):
         return False
     try:

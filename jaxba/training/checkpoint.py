@@ -94,9 +94,8 @@ def steps(folder: Path) -> list[int]:
 
 def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
     """Writes a checkpoint, over an old one of the same number, then removes all but the last `keep` up to it, this one
-    included, and incomplete ones of a killed process. The folder is created if it is missing; metadata are anything
-    that JSON can hold. Raises TrainError: it cannot be written; those before are still there. Raises OSError: the
-    folder cannot be created."""
+    included, and incomplete ones of a killed process. The folder is created if missing; metadata are JSON. Raises
+    TrainError: it cannot be written; those before are still there. Raises OSError: the folder cannot be created."""
     folder.mkdir(parents=True, exist_ok=True)
     path = _path(folder, step)
     if path.is_dir():  # no checkpoint, and in the way of one

@@ -129,7 +129,6 @@ def _keys(config: TrainConfig) -> Any:
 
 
 def _shapes(config: TrainConfig, env: Any) -> Any:
-    """Those of the loop's state."""
     return jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, _keys(config)))
 
 
@@ -200,7 +199,6 @@ class _Run:
             self.best = tuple(Best(_agent(actors, k), agent=k, **one) for k, one in enumerate(best))
 
     def _read_latest(self, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
-        """Metadata and arrays."""
         reasons = []
         for step in reversed(checkpoint.steps(self.folder)):
             try:

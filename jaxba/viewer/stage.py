@@ -116,7 +116,6 @@ class Stage:
         return self.points[keep[self.points]]
 
     def _seen(self) -> np.ndarray:
-        """Points that the chosen image sees."""
         return np.asarray(self.problem.point_index)[np.asarray(self.problem.camera_index) == self.chosen]
 
     def view_of(self, camera: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -178,7 +177,6 @@ class Stage:
         return colours(self._values()[name], *self.limits[name])
 
     def _values(self) -> dict[str, np.ndarray]:
-        """What colours show."""
         found = self.measures
         return {ERROR: found.of_point, TRACK: found.tracks.astype(float), IMAGE: found.of_image}
 

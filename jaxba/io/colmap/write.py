@@ -41,8 +41,7 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     Its image size is made up: the smallest even one that holds all its pixels around the centre, its principal point.
     Other lenses keep their pixels, models and numbers. Weights, and what is constant, cannot be stored.
 
-    Raises ProblemError: the problem is not one of that model or cannot be stored, images of one camera have different
-    intrinsics, or the folder cannot be written."""
+    Raises ProblemError: another model's problem, unstorable, different intrinsics of a camera, unwritable folder."""
     if like is None:
         write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
