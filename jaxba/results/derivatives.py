@@ -105,9 +105,10 @@ def differentiable_solve(
     lenses, angles, ratios of distances, and aligned cameras, has no other derivative; the rest of what a solve finds
     also depends on its way there, which differences see and derivatives do not.
 
-    The problem says all that the inputs do not. `policy` and `options` are as for `solve`. Tolerances should be tight:
-    the theorem holds at a minimum. Derivatives of the returned function raise a ProblemError if conjugate gradients do
-    not solve with the Hessian, as where more than gauge and depths of points is not determined."""
+    The problem says everything that the inputs do not: who sees what, lenses, constants, priors, rigs. `policy` and
+    `options` are as for `solve`. Tolerances should be tight: the theorem holds at a minimum. Derivatives of the
+    returned function raise a ProblemError if conjugate gradients do not solve with the Hessian, as where more than
+    gauge and depths of points is not determined."""
     check_problem(problem)
     options = checked_options(options)
 

@@ -89,7 +89,8 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Constant points stay. Images that face away from their points are left out, as by `solve`. Best at the end of a
     solve: at a bad start points would be fitted to wrong cameras.
 
-    Returns the problem with the moved points, in float64. Raises ProblemError: the cost is not finite."""
+    `loss` is that of the squared whitened residual. Returns the problem with moved points, in float64. Raises
+    ProblemError: the cost is not finite."""
     check_problem(problem)
     return retriangulate_without(facing_away(problem), problem, loss)
 
