@@ -1,7 +1,6 @@
 """Charts of a page in the words of plotly.js: lines over one of several x axes, and the charts of a benchmark.
 
-The key `meta` of a trace is the chip that hides it; `x` and `y` are `{axis: values}`, one for each position of the
-page's switch, or values that are the same for all.
+A trace's `meta` is the chip that hides it; `x` and `y` are `{axis: values}` by the switch, or the same for all.
 """
 
 from __future__ import annotations
@@ -204,7 +203,9 @@ def problem_charts(
         styles: of the solvers.
     """
     runs = representatives(records, problem)
-    axes = {"iterations": axis("iteration"), "time": axis("solve time (s)", log=_time_is_log(runs.values()))}
+    ends = [end for end in map(_end, runs.values()) if 0 < end < math.inf]
+    log = bool(ends) and max(ends) / min(ends) > LOG_TIME_SPREAD
+    axes = {"iterations": axis("iteration"), "time": axis("solve time (s)", log=log)}
     f0, f_star = profile.initial_costs(records)[problem], profile.best_cost(records)[problem]
     gaps = {e: profile.relative_threshold(f0, f_star, e) - f_star for e in profile.RELATIVE_TOLERANCES}
     floored = {e for e in gaps if not e * f_star > profile.ZERO_RESIDUAL_FLOOR * f0}
@@ -243,11 +244,6 @@ def representatives(records: Sequence[Record], problem: str) -> dict[str, Record
     own = [r for r in records if r.problem == problem]
     runs = {solver: [r for r in own if r.solver == solver] for solver in profile.solver_names(own)}
     return {solver: sorted(items, key=_end)[(len(items) - 1) // 2] for solver, items in runs.items()}
-
-
-def _time_is_log(runs: Iterable[Record]) -> bool:
-    ends = [end for end in map(_end, runs) if 0 < end < math.inf]
-    return bool(ends) and max(ends) / min(ends) > LOG_TIME_SPREAD
 
 
 def _end(record: Record) -> float:

@@ -1,7 +1,6 @@
 """One HTML page with interactive charts and sortable tables that opens without a server and fetches nothing.
 
-Charts are drawn by plotly.js, which the page holds: 4.8 MB of the package plotly. The page forbids its browser every
-address (Content-Security-Policy).
+It holds plotly.js: 4.8 MB. It forbids its browser every address (Content-Security-Policy).
 """
 
 from __future__ import annotations
@@ -27,13 +26,11 @@ DIGITS = 7
 
 
 class Page:
-    """A page that is put together from top to bottom; names, titles and notes are escaped, and so are names in charts,
-    where plotly.js knows tags."""
+    """A page, put together from top to bottom. Names, titles and notes are escaped, also in charts."""
 
     def __init__(self, title: str, facts: Mapping[str, str], styles: Mapping[str, Style], axes: Sequence[str]) -> None:
-        """`facts` are machine, versions and the like, on top; the value of `command` is set as code. `styles` are those
-        of what a reader can show and hide, by its name, and `axes` the positions of the switch of the x axis, the first
-        one at the start."""
+        """`facts` are machine, versions and the like, on top; the value of `command` is set as code. `styles` are of
+        what a reader can hide, `axes` the positions of the switch of the x axis."""
         self.title, self.facts, self.styles, self.axes = title, facts, styles, axes
         self._charts: list[Chart] = []
         self._sections: list[str] = []

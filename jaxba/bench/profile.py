@@ -31,8 +31,7 @@ RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
 """Values of epsilon in the target `f <= f*(1 + epsilon)`."""
 
 ZERO_RESIDUAL_FLOOR = 1e-12
-"""Costs up to f* plus this times f0 satisfy every relative tolerance. Without it, a problem whose best cost is rounding
-error (f* ~ 1e-26) would demand the same rounding error of every solver."""
+"""Costs up to f* plus this times f0 satisfy every relative tolerance, since f* may be rounding error (1e-26)."""
 
 INITIAL_COST_TOLERANCE = 1e-2
 """Relative difference of initial costs above which two solvers had different starts. Source: rootba."""
@@ -44,8 +43,7 @@ the 31 observations of Ladybug-49 whose points are behind their cameras, as COLM
 CONVERGED = frozenset(
     {"cost", "step", "gradient", "rounding", "within", "converged", "convergence", "ftol", "xtol", "gtol"}
 )
-"""Values of `Record.termination`, in lower case, that mean converged; all others mean failed. The first five are
-members of `Termination`; other libraries write "converged" or "CONVERGENCE"."""
+"""Values of `Record.termination`, in lower case, that mean converged; the first five are those of `Termination`."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +120,7 @@ def best_cost(records: Iterable[Record]) -> dict[str, float]:
 
 
 def lowest_cost(record: Record) -> float:
-    """The lowest finite accepted cost of a run, NaN if there is none. The trace of a float32 run is ignored, since its
-    rounding errors are too large."""
+    """The lowest finite accepted cost of a run, or NaN. A float32 run's trace is ignored for its rounding errors."""
     trace = [] if record.dtype == "float32" else [point.cost for point in record.trace]
     return min(filter(math.isfinite, (record.final_cost, *trace)), default=math.nan)
 
@@ -162,8 +159,7 @@ def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
 
 
 def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str, Reached]]:
-    """Iterations and time to a target as `table[solver][problem]`, medians over repeats. Pairs that were not run are
-    absent."""
+    """Iterations and time to a target, `table[solver][problem]`, medians over repeats, without pairs not run."""
     starts, bests = initial_costs(records), best_cost(records)
     found: dict[str, dict[str, list[Reached]]] = {}
     for r in records:
@@ -215,8 +211,7 @@ def _ratio(time: float, best: float) -> float:
 
 
 def cost_warnings(records: Sequence[Record]) -> list[str]:
-    """A warning for each problem on which solvers have different initial costs, and so did not minimise the same
-    function from the same start."""
+    """A warning for each problem on which initial costs of solvers differ: they minimised different functions."""
     lines = []
     for name, runs in by_problem(records).items():
         costs = {r.solver: r.initial_cost for r in runs if math.isfinite(r.initial_cost)}

@@ -44,14 +44,9 @@ SETTINGS = "settings.json"
 class RunSettings:
     """Settings shared by all runs of a benchmark."""
 
-    max_iterations: int = MAX_ITERATIONS
-    """Limit of linear solves."""
-
-    linear_solver: str = "auto"
-    """`auto`, `explicit`, `sparse` or `implicit`. Applies to the method `lm`; others have their own solver."""
-
-    pad: bool = False
-    """Whether problems are padded, so that those of one capacity share compiled programs."""
+    max_iterations: int = MAX_ITERATIONS  # limit of linear solves
+    linear_solver: str = "auto"  # of the method `lm`; others have their own
+    pad: bool = False  # whether problems are padded, so that those of one capacity share compiled programs
 
 
 @dataclass(frozen=True)
@@ -125,16 +120,12 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     for solver in parsed:
         require(solver)
         if not solver.peer:
-            _check_options(solver)
+            policy, options = solver.build()
+            try:
+                options.step_options(policy)
+            except ValueError as error:
+                raise InputError(f"{error} (in {str(solver)!r})") from None
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
-
-
-def _check_options(solver: SolverName) -> None:
-    policy, options = solver.build()
-    try:
-        options.step_options(policy)
-    except ValueError as error:
-        raise InputError(f"{error} (in {str(solver)!r})") from None
 
 
 def open_folder(
@@ -142,8 +133,7 @@ def open_folder(
 ) -> list[Record]:
     """Creates the folder, or continues a benchmark in it. Writes the settings and the command. Returns the records that
     the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, of another
-    command if that must be `alone`, or results of other problems or policies under the same names. Files are compared
-    by checksum."""
+    command if that must be `alone`, or results of other problems or policies (by checksum) under the same names."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
@@ -182,8 +172,7 @@ def _results(path: Path) -> list[Record]:
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a COLMAP model. Empty if a file cannot be read; reading the problem or the
-    policy reports that later."""
+    """SHA-256 of a file, or of all files of a COLMAP model. Empty if one cannot be read: later reading reports it."""
     total = hashlib.sha256()
     try:
         for part in visible(path) if path.is_dir() else [path]:
@@ -208,9 +197,8 @@ def execute(
     """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
     A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or runs out of memory
-    on it, is reported and skipped for this problem. `done` are records of earlier runs, and `on_error` is called for
-    what is skipped. With `strict` these are also problems of which a part would be left out. Raises OSError: a result
-    cannot be written."""
+    on it, is reported and skipped for this problem. `done` are records of earlier runs; `on_error` is called for what
+    is skipped, with `strict` also problems that would lose a part. Raises OSError: a result cannot be written."""
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()
     for job in jobs:

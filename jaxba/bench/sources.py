@@ -26,21 +26,13 @@ _GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)
 class Source:
     """A named problem that has not been read yet."""
 
-    name: str
-    """Unique within a benchmark."""
-
-    family: str
-    """Name of the folder of a file; `scene` for a random scene."""
-
-    location: str
-    """Path, or `scene:NAME:SEED`."""
-
-    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)
-    """Makes the problem, where its location does not say how."""
+    name: str  # unique within a benchmark
+    family: str  # name of the folder of a file; `scene` for a random scene
+    location: str  # path, or `scene:NAME:SEED`
+    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)  # where its location does not say how
 
     def read(self, *, strict: bool = False) -> BundleProblem:
-        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: the input is invalid;
-        the message is one line."""
+        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: one line."""
         if self.make is not None:
             return self.make()
         if not self.location.startswith(SCENE_PREFIX):
@@ -55,6 +47,7 @@ def sources(locations: list[str]) -> list[Source]:
     or names of downloaded BAL problems such as ladybug-49, if there is no file of that name; duplicates count once.
     Raises ProblemError: a missing file or an unknown scene; the message is one line."""
     found: list[Source] = []
+    place = lambda one: one if one.startswith(SCENE_PREFIX) else Path(one).resolve()
     for location in locations:
         if location.startswith(SCENE_PREFIX):
             name, seed = _scene(location)
@@ -74,7 +67,7 @@ def sources(locations: list[str]) -> list[Source]:
                 label = _model_name(path)
             # reports and figures cannot show bytes that are not valid text
             label, family = display_name(label), display_name(path.resolve().parent.name)
-        if any(_same(source.location, location) for source in found):
+        if place(location) in [place(source.location) for source in found]:
             continue
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:
@@ -87,15 +80,8 @@ def sources(locations: list[str]) -> list[Source]:
     return found
 
 
-def _same(one: str, other: str) -> bool:
-    if one.startswith(SCENE_PREFIX) or other.startswith(SCENE_PREFIX):
-        return one == other
-    return Path(one).resolve() == Path(other).resolve()
-
-
 def _model_name(folder: Path) -> str:
-    """Name of a COLMAP model: the name of its folder, preceded by those above it up to the first that is not generic,
-    e.g. `garden-sparse-0`."""
+    """Name of a COLMAP model: that of its folder, after those above up to one not generic: `garden-sparse-0`."""
     parts = list(folder.resolve().parts[1:]) or ["model"]
     count = next((k for k, part in enumerate(reversed(parts), 1) if not _GENERIC_FOLDER.fullmatch(part)), len(parts))
     return "-".join(parts[-count:])

@@ -92,8 +92,7 @@ class Summary:
     solvers: list[SolverSummary]
     cells: list[Cell]
     warnings: list[str]
-    metadata: dict[str, Any] = field(default_factory=dict)
-    """Device, threads, versions and the like."""
+    metadata: dict[str, Any] = field(default_factory=dict)  # device, threads, versions and the like
 
 
 def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapping[str, Any] | None = None) -> Summary:
@@ -111,12 +110,15 @@ def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapp
             if runs:
                 reaches = {key: table[solver][name] for key, table in tables.items()}
                 cells.append(_cell(runs, reaches, starts[name], bests[name]))
+    counts = {solver: sum(cell.solver == solver for cell in cells) for solver in solvers}
+    few = {solver: count for solver, count in counts.items() if count < len(names)}
+    warning = "{} was run on {} of {} problems; the others count as not reached"
     return Summary(
         targets=targets,
         problems=[_problem(runs, starts[name], bests[name]) for name, runs in profile.by_problem(records).items()],
         solvers=[_solver(solver, cells, found, len(names)) for solver in solvers],
         cells=cells,
-        warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
+        warnings=profile.cost_warnings(records) + [warning.format(*one, len(names)) for one in few.items()],
         metadata=dict(metadata or {}),
     )
 
@@ -175,15 +177,6 @@ def _target(own: Reached) -> TargetSummary:
         iterations_capped=geometric_mean(capped(own.iterations, profile.ITERATION_LIMIT)),
         seconds=geometric_mean(own.seconds[reached], SHORTEST_TIME),
     )
-
-
-def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Sequence[str]) -> list[str]:
-    counts = {solver: sum(cell.solver == solver for cell in cells) for solver in solvers}
-    return [
-        f"{solver} was run on {count} of {len(names)} problems; the others count as not reached"
-        for solver, count in counts.items()
-        if count < len(names)
-    ]
 
 
 def to_json(summary: Summary) -> dict[str, Any]:

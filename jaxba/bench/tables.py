@@ -21,10 +21,8 @@ class Table:
     title: str
     header: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    note: str
-    """Explains the numbers in one or two sentences."""
-    text_columns: int = 1
-    """Number of columns that are aligned left."""
+    note: str  # explains the numbers in one or two sentences
+    text_columns: int = 1  # number of columns that are aligned left
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -86,8 +86,7 @@ def _held_out(rows: Sequence[Row], rules: Mapping[str, Any], styles: Mapping[str
 def _curve(
     rows: Sequence[Row], metric: str, style: Style, scale: float = 1.0, name: str = TRAINED, label: str = ""
 ) -> list[Chart]:
-    """A metric over the chunks that have it, the mean over agents. Of several agents that are `TRAINED`, also the range
-    and each one."""
+    """The mean of a metric over agents, by chunk. Of several agents that are `TRAINED`, also the range and each one."""
     chunks: dict[int, tuple[Row, list[float]]] = {}
     for row in rows:
         if row.get(metric) is not None:

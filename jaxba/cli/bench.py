@@ -87,12 +87,10 @@ def _bench(args: Arguments, command: str) -> int:
     solvers = [name for name in (args.solvers or DEFAULT_SOLVERS).split(",") if name.strip()]
     tolerance = 1e-3 if args.tolerance is None else float(args.tolerance)
     repeats = 3 if args.repeats is None else args.repeats
-    if not 0 < tolerance < 1:
-        raise common.UsageError(f"--tolerance must lie between 0 and 1, is {tolerance:g}")
+    common.require(0 < tolerance < 1, f"--tolerance must lie between 0 and 1, is {tolerance:g}")
     max_iterations = 100 if args.max_iterations is None else args.max_iterations
     common.check_positive(repeats=repeats, max_iterations=max_iterations)
-    if not solvers:
-        raise common.UsageError("--solvers names no solver")
+    common.require(bool(solvers), "--solvers names no solver")
     from jaxba.bench import run
     from jaxba.bench.sources import SCENE_PREFIX, sources
     from jaxba.scenes import DEFAULT_SCENES
@@ -108,7 +106,6 @@ def _bench(args: Arguments, command: str) -> int:
 
 
 def _open(args: Arguments, jobs: Any, settings: Any, command: str) -> tuple[Path, Any]:
-    """The folder of the results, and the records in it."""
     from jaxba.bench import run
     from jaxba.problem.bundle_problem import ProblemError
 
@@ -139,8 +136,7 @@ def _check_apart(folder: Path, args: Arguments, jobs: Any) -> None:
 def _run_missing(
     folder: Path, done: Any, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str
 ) -> int:
-    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError if a file cannot be
-    written."""
+    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError: it cannot."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -189,7 +185,6 @@ def _run_missing(
 
 
 def _line(problem: str, records: Any) -> str:
-    """What was done on a problem."""
     seconds = sum(one.setup_s + one.compile_s + one.total_s for one in records)
     compiled, cost = sum(one.compile_s for one in records), min(one.final_cost for one in records)
     runs = common.counted(len(records), "run")
@@ -200,19 +195,14 @@ def _line(problem: str, records: Any) -> str:
 class Suite:
     """Content of a suite file; the command line replaces what it gives, by the options of the same names."""
 
-    problems: tuple[str, ...] = ()
-    """Names or paths, in which $VARIABLES and wildcards are expanded."""
-
-    solvers: tuple[str, ...] | None = None
-    """Names of solvers."""
-
+    problems: tuple[str, ...] = ()  # names or paths, in which $VARIABLES and wildcards are expanded
+    solvers: tuple[str, ...] | None = None  # names of solvers
     tolerance: float | None = None
     repeats: int | None = None
     max_iterations: int | None = None
 
 
 def _with_suite(args: Arguments) -> Arguments:
-    """The arguments, completed by those of the suite."""
     if args.suite is None:
         return args
     from jaxba import settings
@@ -238,14 +228,11 @@ def _with_suite(args: Arguments) -> Arguments:
 def _expand(args: Arguments, entry: str) -> list[str]:
     """The names or paths for an entry of a suite's problems, with variables and wildcards expanded."""
     for name in _VARIABLE.findall(entry):
-        if not os.environ.get(name):
-            raise common.UsageError(
-                f"--suite {args.suite}: {entry}: the environment variable {name}, a folder of problems, is not set"
-            )
+        unset = f"{entry}: the environment variable {name}, a folder of problems, is not set"
+        common.require(bool(os.environ.get(name)), f"--suite {args.suite}: {unset}")
     expanded = os.path.expandvars(entry)
     if not glob.has_magic(expanded):
         return [expanded]
     found = sorted(glob.glob(expanded))
-    if not found:
-        raise common.UsageError(f"--suite {args.suite}: {expanded}: no such file")
+    common.require(bool(found), f"--suite {args.suite}: {expanded}: no such file")
     return found

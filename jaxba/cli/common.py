@@ -43,9 +43,8 @@ def run_command(
     argv: Sequence[str] | None,
     subcommand: str = "",
 ) -> int:
-    """Parses the command line and runs `main`. Expected errors are printed as one line to stderr, and so is a Ctrl-C or
-    SIGTERM that `main` does not handle. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or
-    143 after SIGTERM.
+    """Parses the command line and runs `main`. Expected errors, and signals that `main` does not handle, are one line
+    on stderr. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
 
     Args:
         arguments: class of the arguments, made by `options`, in the module that has the command's name.
@@ -79,7 +78,6 @@ def command_line(name: str, argv: Sequence[str] | None) -> str:
 
 
 def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> int:
-    """Runs a command with what `parse` has found."""
     if parsed is None:
         return 0
     if isinstance(parsed, str):
@@ -150,8 +148,7 @@ def exit_with(status: int) -> NoReturn:
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK. `untraced` says
-    which cache: see `use_compilation_cache`."""
+    """Keeps freed memory, loads LAPACK, and enables the cache of programs; `untraced`: see `use_compilation_cache`."""
     from jaxba.runtime import process
 
     process.keep_memory()
@@ -216,55 +213,46 @@ def require(fulfilled: bool, message: str) -> None:
 
 
 def check_writable(option: str, path: str | None) -> None:
-    """Checks that the file of an output option can be written, before any work is done; None and the names of streams
-    are accepted. Raises UsageError: the folder is missing or not writable, the file is read-only, or the path is that
-    of a folder."""
+    """Checks that an output file can be written, before any work; None and names of streams are accepted. Raises
+    UsageError: the folder is missing or not writable, the file is read-only, or the path is that of a folder."""
     from jaxba.io.files import STREAMS
 
     if path is None or path.startswith(STREAMS):
         return
     target = Path(os.path.realpath(path))  # a symbolic link is kept, and its target is written
-    if target.is_dir():
-        raise UsageError(f"{option} {path}: is a directory")
-    if path.endswith(tuple(filter(None, (os.sep, os.altsep)))):
-        raise UsageError(f"{option} {path}: is the name of a directory, not of a file")
+    require(not target.is_dir(), f"{option} {path}: is a directory")
+    separators = tuple(filter(None, (os.sep, os.altsep)))
+    require(not path.endswith(separators), f"{option} {path}: is the name of a directory, not of a file")
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is written directly
-        if not os.access(path, os.W_OK):
-            raise UsageError(f"{option} {path}: cannot be written")
+        require(os.access(path, os.W_OK), f"{option} {path}: cannot be written")
         return
     folder = target.parent if Path(path).is_symlink() else Path(path).parent
-    if not target.parent.is_dir():
-        raise UsageError(f"{option} {path}: folder {folder} does not exist")
-    if not os.access(target.parent, os.W_OK):
-        raise UsageError(f"{option} {path}: folder {folder} cannot be written")
-    if target.exists() and not target.stat().st_mode & _WRITABLE:
-        raise UsageError(f"{option} {path}: is a read-only file")
+    require(target.parent.is_dir(), f"{option} {path}: folder {folder} does not exist")
+    require(os.access(target.parent, os.W_OK), f"{option} {path}: folder {folder} cannot be written")
+    read_only = target.exists() and not target.stat().st_mode & _WRITABLE
+    require(not read_only, f"{option} {path}: is a read-only file")
 
 
 def check_folder(option: str, path: str) -> None:
     """Checks that an output folder can be created or written, before any work is done. Raises UsageError: it is a file
     or not writable, or it does not exist and its parent is missing or not writable."""
     target = Path(path).absolute()
-    if target.exists() and not target.is_dir():
-        raise UsageError(f"{option} {path}: is a file, not a folder")
     if not target.exists():
-        check_writable(option, str(Path(path)))  # without a trailing separator
-    elif not os.access(target, os.W_OK):
-        raise UsageError(f"{option} {path}: folder cannot be written")
+        return check_writable(option, str(Path(path)))  # without a trailing separator
+    require(target.is_dir(), f"{option} {path}: is a file, not a folder")
+    require(os.access(target, os.W_OK), f"{option} {path}: folder cannot be written")
 
 
 def check_positive(**values: Any) -> None:
     """Checks that numbers are positive, that tolerances (names ending in `tol`) are not negative, and that integers are
-    not too large for 32 bits. Values are given by argument name. Raises UsageError: a value is invalid; the message
-    names the option."""
+    not too large for 32 bits. Values are by argument name. Raises UsageError: an invalid value; names the option."""
     from jaxba.typing import LARGEST_COUNT
 
     for name, value in values.items():
         option = "--" + name.replace("_", "-")
         if name.endswith("tol"):
-            if not value >= 0:
-                raise UsageError(f"{option} must not be negative, is {value:g}")
-        elif not value > 0:
-            raise UsageError(f"{option} must be positive, is {value:g}")
-        elif isinstance(value, int) and value > LARGEST_COUNT:
-            raise UsageError(f"{option} must be at most {LARGEST_COUNT}, is {value}")
+            require(value >= 0, f"{option} must not be negative, is {value:g}")
+            continue
+        require(value > 0, f"{option} must be positive, is {value:g}")
+        too_large = isinstance(value, int) and value > LARGEST_COUNT
+        require(not too_large, f"{option} must be at most {LARGEST_COUNT}, is {value}")

@@ -35,8 +35,7 @@ def meant(items: Sequence[str], names: Container[str] = ()) -> list[Any]:
 
 
 def parse_items(value: Any, what: str) -> list[str]:
-    """A list of names or ids; one alone counts as a list, an empty value as an empty one. Raises ValueError: something
-    else; one line."""
+    """A list of names or ids; one alone counts as a list, nothing as an empty one. Raises ValueError: one line."""
     items = value if isinstance(value, list) else [value] if value != "" else []
     for item in items:
         if not isinstance(item, str) or not item:

@@ -65,8 +65,7 @@ def constrained(
 
 
 def _with_known_places(problem: BundleProblem) -> np.ndarray:
-    """One camera or more of every frame, whose pose is the frame's: its place in the rig is constant. Raises
-    ValueError: a frame has none."""
+    """Cameras of every frame that have a constant place in the rig. Raises ValueError: a frame has none."""
     rigs = problem.rigs
     if rigs is None or rigs.free is None:
         return np.ones(problem.num_cameras, bool)

@@ -22,8 +22,7 @@ class Download:
     """Folder with the families. Default: that of the data set."""
 
     checksum: bool = True
-    """Compare the checksum; else unpack the file and compare its header with its name, as for files without a known
-    checksum."""
+    """Compare the checksum; else unpack the file and compare its header with its name, as without a known one."""
 
 
 @options
@@ -98,8 +97,7 @@ def _download(args: Download) -> int:
 
     from jaxba.datasets.bal.paths import data_folder, select
 
-    if not args.names:
-        raise common.UsageError("name a problem or a family; jaxba-data list shows them")
+    common.require(bool(args.names), "name a problem or a family; jaxba-data list shows them")
     entries, folder = select(args.names), data_folder()
     common.check_extra("jaxba.datasets.bal.download")
     from jaxba.datasets.bal import download

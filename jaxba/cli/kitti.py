@@ -47,8 +47,7 @@ class Files:
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
 
     out: Annotated[str, "FILE"] = "kitti.txt.bz2"
-    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json beside it has the frame of
-    each camera."""
+    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz); NAME.frames.json beside it has the frames."""
 
     frames: Annotated[str, "A:B:STEP"] = ":"
     """Range of frame numbers, without the end, such as 0:200."""
@@ -112,7 +111,6 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _check(args: Arguments) -> None:
-    """Checks the options, and that OpenCV is installed."""
     common.check_positive(
         keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
     )
@@ -222,17 +220,20 @@ def _evaluate(args: EvaluateArguments) -> int:
     common.require(bool(args.lengths) and all(length > 0 for length in args.lengths), "--lengths must be positive")
     from jaxba.kitti import plots
 
-    _check_results_apart(args)
+    files, folder = [args.problem, *args.solutions], Path(args.out)
+    names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
+    names += ["evaluation.json", "poses-truth.txt", "top-view.png", "top-view.svg"]
+    read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
+    check_apart({"--out": [folder / name for name in names]}, read)
     side = read_sidecar(args.problem)
     truth = None if args.poses is None else poses_of(read_poses(args.poses), side.frames, side.calibration)
     with common.notes_printed():
-        results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
+        results = evaluate.evaluate(files, side, truth, args.lengths)
     ate = lambda row: f", ATE {row['ate_m']['rmse']:.2f} m" if "ate_m" in row else ""
     views = [(row["name"] + ate(row), points, poses[:, :, 3]) for row, poses, points in results]
     rows = [numbers for numbers, _, _ in results]
     contents = json.dumps({"frames": side.frames, "results": rows}, allow_nan=False)
     figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
-    folder = Path(args.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "evaluation.json", contents + "\n")
@@ -240,22 +241,13 @@ def _evaluate(args: EvaluateArguments) -> int:
             evaluate.write_poses(folder / f"poses-{at}-{numbers['name']}.txt", poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
-        files = plots.save_figure(figure, folder / "top-view")
+        drawn = plots.save_figure(figure, folder / "top-view")[0]
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     console = common.console()
     console.print(_evaluate_table(rows, truth))
-    console.print(f"wrote {files[0]} and {len(results) + (truth is not None) + 2} files beside it")
+    console.print(f"wrote {drawn} and {len(results) + (truth is not None) + 2} files beside it")
     return 0
-
-
-def _check_results_apart(args: EvaluateArguments) -> None:
-    """Refuses results in the place of a file that is compared."""
-    files, folder = [args.problem, *args.solutions], Path(args.out)
-    names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
-    names += ["evaluation.json", "poses-truth.txt", "top-view.png", "top-view.svg"]
-    read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
-    check_apart({"--out": [folder / name for name in names]}, read)
 
 
 def _evaluate_table(results: list[dict[str, Any]], truth: Any) -> Any:
@@ -290,8 +282,7 @@ def _table(title: str, first: str, *columns: str) -> Any:
 
 @contextmanager
 def _progress(console: Any) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on a terminal, otherwise a line for every stage: a function of the stage, what is done and the
-    total."""
+    """A progress bar on a terminal, else a line a stage: a function of the stage, what is done and the total."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

@@ -24,7 +24,6 @@ def is_model(output: str, source: str | None) -> bool:
 
 
 def _is_like_source(output: str, source: str | None) -> bool:
-    """Whether the output is written as a COLMAP model like that of the problem."""
     return source is not None and is_colmap(source) and is_model(output, source)
 
 
@@ -54,13 +53,14 @@ def check_outputs(
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:
     """Checks that the format of the output can hold the problem's lenses. Raises ProblemError: it cannot; one line."""
-    if output and not is_model(output, source) and formats.holds_bal_only(output):
-        check_bal_lenses(problem, output)
+    if output and not is_model(output, source):
+        known = formats.by_ending(output)
+        if known is None or known.name != "PLY":
+            check_bal_lenses(problem, output)
 
 
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
-    """Writes the solution, and prints what was written and what the file format cannot store. Raises UsageError: the
-    solution cannot be written."""
+    """Writes the solution, and prints what was written and what the file cannot store. Raises UsageError: it fails."""
     model, like = is_model(output, source), _is_like_source(output, source)
     try:
         if like:

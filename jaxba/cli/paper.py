@@ -48,8 +48,7 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 if the report was written, 2 for bad input, 130 after Ctrl-C (results are
-    kept)."""
+    """Runs the command. Exit status: 0 for a report, 2 for bad input, 130 after Ctrl-C (results are kept)."""
     return common.run_command(Arguments, _paper, "Reproduces the tables and figures of the paper.", argv)
 
 

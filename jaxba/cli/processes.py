@@ -30,9 +30,8 @@ class Devices:
 
 
 def start(args: Devices) -> list[Any]:
-    """Starts JAX with other processes if options ask for them; must come before any computation. Returns the devices,
-    those of all processes; none for JAX's default one, if no option is given. Raises InputError: bad options, or they
-    cannot be met."""
+    """Starts JAX with other processes if asked to; must come before any computation. Returns the devices of all
+    processes; none, without options, for JAX's default one. Raises InputError: bad options, or they cannot be met."""
     named = [x is not None for x in (args.coordinator, args.processes, args.process)]
     if not (any(named) or args.distributed or args.devices is not None):
         return []

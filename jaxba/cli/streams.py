@@ -14,16 +14,14 @@ from typing import Any
 
 
 class UnwritableStreamError(Exception):
-    """Standard output cannot be written, for another reason than that its reader has closed it. No `OSError`, which
-    commands take for one of their files."""
+    """Standard output cannot be written, though its reader is there. No `OSError`, which would be one of a file."""
 
 
 class TolerantStream:
     """A text stream that, once its reader has closed it, discards what is written."""
 
     def __init__(self, stream: Any, *, discard_all: bool) -> None:
-        """For standard output or error. `discard_all`: whether to do so after any other error, too, instead of raising
-        an `UnwritableStreamError`."""
+        """`discard_all`: after any other error, too, instead of raising an `UnwritableStreamError`."""
         self._stream, self._discard_all = stream, discard_all
 
     def __getattr__(self, name: str) -> Any:
@@ -50,7 +48,8 @@ class TolerantStream:
         try:
             yield
         except OSError as error:
-            discard(self._stream)
+            with suppress(OSError, ValueError):  # a stream without a file; what it has buffered is discarded, too
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
             if not (self._discard_all or isinstance(error, BrokenPipeError)):
                 raise UnwritableStreamError(f"standard output: {error.strerror or error}") from None
 
@@ -65,12 +64,6 @@ def whole_input() -> str:
             os.dup2(copy.fileno(), 0)
         os.lseek(0, 0, os.SEEK_SET)
     return "/dev/stdin"
-
-
-def discard(stream: Any) -> None:
-    """Redirects a stream, including what it has buffered, to the null device."""
-    with suppress(OSError, ValueError):  # a stream without a file
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextmanager

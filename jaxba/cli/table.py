@@ -60,7 +60,6 @@ def _lenses(problem: BundleProblem, options: StepOptions) -> Iterator[str]:
 
 
 def _constants(problem: BundleProblem) -> list[str]:
-    """What of poses and points is constant."""
     if problem.constants is None:
         return []
     poses = np.asarray(problem.constants.poses)
@@ -165,8 +164,7 @@ def padding(problem: BundleProblem, solution: Solution) -> str:
 
 
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
-    """Notes on the data: cameras and points without observations, points with one, points behind cameras. Rows of other
-    residuals count as observations."""
+    """Notes on what has no observations, on points with one, and behind cameras. Other residuals' rows count too."""
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     for own in (own for rows in problem.residuals.rows for own in rows.points):
         points += np.bincount(own[own >= 0], minlength=problem.num_points)

@@ -60,8 +60,7 @@ class Arguments:
     classes if it has none."""
 
     resume: bool = False
-    """Continue the run in the folder from its last checkpoint. The results are those of an uninterrupted run, bit for
-    bit."""
+    """Continue the run in the folder from its last checkpoint: the same results as without interruption, bit by bit."""
 
 
 def main() -> None:
@@ -70,18 +69,10 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 if the policy was written, 2 for bad input, 130 after Ctrl-C (the run is
-    saved)."""
+    """Runs the command. Exit status: 0 for a policy, 2 for bad input, 130 after Ctrl-C (the run is saved)."""
     command = common.command_line("jaxba-train", argv)
     train = functools.partial(_train, command=command)
     return common.run_command(Arguments, train, "Trains a damping policy on random scenes.", argv)
-
-
-def _train(args: Arguments, command: str) -> int:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
-    return _run(args, command)
 
 
 def _prepare(args: Arguments, folder: Path, name: str) -> Any:
@@ -94,8 +85,8 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     overrides = tuple(item for group in args.overrides for item in group)
     overrides += () if args.seeds is None else (f"seeds={args.seeds}",)
     config = None if args.resume and args.config is None else configs.load(name, overrides)
-    if args.problems and config is None:
-        raise common.UsageError("--problems: a resumed run has its scenes in its folder")
+    resumed = args.problems and config is None
+    common.require(not resumed, "--problems: a resumed run has its scenes in its folder")
     if args.problems and config is not None:
         config = configs.with_problems(config, _check_problems(args.problems))
     if config is not None and not args.resume:  # the configuration of a run that goes on is its own
@@ -104,10 +95,13 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     return driver.prepare_folder(folder, config, args.resume, overrides)
 
 
-def _run(args: Arguments, command: str) -> int:
+def _train(args: Arguments, command: str) -> int:
+    import jax
+
     from jaxba.runtime import process
     from jaxba.training import driver, task, view
 
+    jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
     config = _prepare(args, folder, name)

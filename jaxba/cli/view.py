@@ -125,8 +125,7 @@ def watched(
     problem: BundleProblem, path: str | None, record: str | None, show: bool
 ) -> tuple[Watch | None, Callable[[], None]]:
     """Opens the page if `show`, for a problem that was read at `path`; `record` is the file of the recording, if one is
-    wanted. Returns `watch` for `jaxba.solve`, and what is to be called after it: it writes the recording, and serves
-    the page until Ctrl-C."""
+    wanted. Returns `watch` for `jaxba.solve`, and what writes the recording and serves the page after it."""
     if record is None and not show:
         return None, lambda: None
     from jaxba.viewer.recording import Recorder, write_recording

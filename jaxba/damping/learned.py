@@ -134,8 +134,7 @@ def always(action: float, config: AgentConfig) -> LearnedPolicy:
 
 
 def learned_from(config: AgentConfig, actor: Any) -> LearnedPolicy:
-    """The policy of a trained actor, by its parameters (`training.networks.Actor`), and of the agent's configuration in
-    training."""
+    """The policy of a trained actor's parameters (`training.networks.Actor`) and of the agent's configuration."""
     stack = actor["params"]["MLP_0"]
     layers = [Layer(stack[f"Dense_{k}"]["kernel"], stack[f"Dense_{k}"]["bias"]) for k in range(len(stack))]
     return LearnedPolicy(tuple(layers), config)

@@ -1,7 +1,6 @@
 """Policy files: a trained agent in one `.safetensors` file.
 
-It holds the weights of the actor, and as metadata the configuration of the agent and the origin of the policy. Reading
-it does not need flax.
+It holds the actor's weights; its metadata are the agent's configuration and the policy's origin.
 """
 
 from __future__ import annotations
@@ -44,8 +43,7 @@ def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str
 
 
 def _with_sorted_metadata(content: bytes) -> bytes:
-    """The same file with its metadata sorted. safetensors writes it in random order; sorted, equal policies are equal
-    files."""
+    """The same file with its metadata sorted, so that equal policies are equal files: safetensors' order is random."""
     size = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -55,8 +53,7 @@ def _with_sorted_metadata(content: bytes) -> bytes:
 
 
 def load_policy(path: str | Path) -> LearnedPolicy:
-    """Reads a policy file. Raises InputError: the file cannot be read, is not a policy, or its weights do not fit its
-    configuration."""
+    """Reads a policy file. Raises InputError: unreadable, no policy, or weights of another configuration."""
     tensors, metadata = _read(Path(path))
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")

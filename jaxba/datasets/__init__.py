@@ -10,6 +10,5 @@ EXAMPLE = Path(__file__).with_name("example.txt.bz2")
 
 
 def example_problem() -> BundleProblem:
-    """The problem that commands call `example`: a street of 24 images and 1,600 points; one in 200 of the
-    7,200 observations is wrong."""
+    """The commands' `example`: a street, 24 images, 1,600 points, 7,200 observations, one in 200 of them wrong."""
     return read_bal(EXAMPLE)

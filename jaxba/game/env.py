@@ -260,8 +260,7 @@ class Game:
 
     @for_traces
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
-        """Uniform actions in half of the environments, Ceres' rule in a quarter, and a hundredth of its lambda in the
-        last quarter."""
+        """Uniform actions in half of the environments; Ceres' rule in a quarter, a hundredth of it in the last one."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
         rules = [jax.vmap(_rule_damping)(part.memory) for part in state.episodes]
@@ -285,9 +284,8 @@ def make_game(
     envs: Sequence[int],
     options: StepOptions | None = None,
 ) -> Game:
-    """A game on `banks` of scenes of the classes `kinds`, with the rules of `config`; `envs` are the numbers of
-    environments of each class. The agent's configuration overrides the `options` of the LM step
-    (`AgentConfig.step_options`)."""
+    """A game on `banks` of scenes of the classes `kinds`, with the rules of `config` and `envs` environments of each
+    class. The agent's configuration overrides the `options` of the LM step (`AgentConfig.step_options`)."""
     options = config.agent.step_options(options or StepOptions())
     for kind in kinds:
         class_layout(kind, options)  # cached on the host before anything is traced

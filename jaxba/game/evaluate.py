@@ -67,8 +67,7 @@ def evaluate(
     tolerance: float = 1e-3,
     limit: int = 40,
 ) -> Score:
-    """The score of a policy on every scene of the banks, with at most `limit` linear solves of each. The tolerance is
-    relative to the best known cost."""
+    """A policy's score on all scenes, in at most `limit` linear solves; `tolerance` is relative to the best cost."""
     runs = play_all(kinds, banks, {"": (policy, options)}, limit)[""]
     return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
 

@@ -1,7 +1,6 @@
 """The game as Gymnasium environments, for trainers that speak NumPy. Needs the extra `gym`.
 
-`GymVectorGame` steps all scenes of a `Game` in one compiled call and resets those that ended. `GymGame` is a game of
-one scene at a time, which its trainer resets.
+`GymVectorGame` steps all scenes in one compiled call and resets those that ended; `GymGame` has one scene.
 """
 
 from __future__ import annotations
@@ -111,8 +110,7 @@ class GymGame(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A new episode. `seed` is that of all random numbers from now on; if None, the current sequence continues.
-        `options` are not used."""
+        """A new episode. `seed` is of all random numbers from now on; None goes on with the sequence."""
         super().reset(seed=seed)
         observation, info = self._one.reset(seed=seed)
         self._running = True

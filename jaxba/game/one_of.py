@@ -46,8 +46,7 @@ class OneOf:
 
 
 def alike(policies: Mapping[str, tuple[DampingPolicy, StepOptions]]) -> dict[str, tuple[DampingPolicy, StepOptions]]:
-    """Policies with their steps, of which those with equal steps are of one structure, so that a function compiles once
-    for them."""
+    """Policies with their steps; those with equal steps have one structure, so that a function compiles once."""
     kinds: dict[StepOptions, dict[Hashable, DampingPolicy]] = {}
     for policy, options in policies.values():
         kinds.setdefault(options, {}).setdefault(_kind(policy), policy)

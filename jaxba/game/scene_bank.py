@@ -52,8 +52,7 @@ MIN_OBSERVATIONS = 30
 """Smallest number of observations of a scene that is solved at all."""
 
 MAX_ERROR_ANGLE = 0.2
-"""Largest root mean square error of a scene that is solved at all, relative to the focal length. It is larger if points
-are close to the plane of a camera."""
+"""Largest RMS error of a solved scene over the focal length; above it points are close to a camera's plane."""
 
 PAPER_ERROR_ANGLE = 1.0
 """The same for the family `paper`, whose starts are far away."""
@@ -107,8 +106,7 @@ DRAWN = 64
 
 @for_traces
 def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
-    """The random scene of a class with this number, for this key. Raises ValueError: none of `DRAWN` scenes is worth
-    solving."""
+    """A class's random scene of this number and key. Raises ValueError: none of `DRAWN` scenes is worth solving."""
     scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
     rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
     if not len(rows):
@@ -210,10 +208,9 @@ def make_banks(
     problems: Sequence[StrPath | BundleProblem] = (),
 ) -> list[Split]:
     """Draws and solves scenes of every class, and splits the usable ones. The same key gives the same banks. `options`
-    are those of the portfolio's steps, `limit` is that of an episode; `report` is called with a line of text when
-    something begins that takes a while. The tolerance of the game does not change which scenes are usable. Windows are
-    cut from `problems`, in memory or files, instead of those that `config` names. Raises InputError: no scene of a
-    class would be left to train on."""
+    are those of the portfolio's steps, `limit` is that of an episode; `report` is called with a line when something
+    long begins. The game's tolerance does not change which are usable. Windows are cut from `problems`, in memory or
+    files, instead of those that `config` names. Raises InputError: no scene of a class would be left to train on."""
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = _shape(kind)
@@ -242,8 +239,7 @@ MORE_CLASSES = 2**30
 """Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (driver.py)."""
 
 HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
-"""Fraction of the usable scenes that is held out; more of them up to a number whose mean says something, but never more
-than the last fraction."""
+"""Fraction of usable scenes held out; more up to a number whose mean says something, at most the last one."""
 
 
 def held_out_count(usable: int) -> int:

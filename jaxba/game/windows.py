@@ -34,10 +34,9 @@ MOVED = 0.5
 def read_windows(
     problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
 ) -> tuple[Scenes, Scenes]:
-    """Windows of problems: those to train on, and held-out ones from other places. Problems are in memory, or files as
-    `jaxba.read_problem` takes them. Of `count` windows, as many of each problem, a fifth is held out; `kind` has their
-    largest numbers of cameras and points, `seed` is that of the choice, and `dtype` that of all numbers. Raises
-    ProblemError: as `read_all`."""
+    """Windows of problems: those to train on, and held-out ones from other places. Problems are in memory, or files. Of
+    `count` windows, as many of each problem, a fifth is held out; `kind` has their largest numbers of cameras and
+    points, `seed` is that of the choice, and `dtype` that of all numbers. Raises ProblemError: as `read_all`."""
     parts: tuple[list, list] = [], []
     for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])

@@ -20,8 +20,7 @@ MARKS = {
 
 
 def read_text(path: StrPath) -> bytes:
-    """The text of a file, decompressed, as `plain_text` gives it. Raises ProblemError: it cannot be read, or is not in
-    the encoding of its mark; one line."""
+    """`plain_text` of a decompressed file. Raises ProblemError: unreadable, or not in its mark's encoding."""
     try:
         return plain_text(read_bytes(path))
     except UnicodeError as error:
@@ -39,9 +38,8 @@ def read_characters(path: StrPath) -> str:
 
 
 def plain_text(data: bytes) -> bytes:
-    """The text in all bytes of a file, without a byte order mark, and with lines that end in LF. What begins with the
-    mark of UTF-16 or UTF-32 becomes UTF-8, everything else stays as it is. Raises UnicodeDecodeError: the text is
-    not in the encoding of its mark."""
+    """The text in all bytes of a file, without a byte order mark, and with lines that end in LF. UTF-16 and UTF-32 with
+    their marks become UTF-8, all else stays. Raises UnicodeDecodeError: the text is not in the encoding of its mark."""
     mark = next((mark for mark in MARKS if data.startswith(mark)), b"")
     text = data[len(mark) :]
     if mark and MARKS[mark] != "utf-8":

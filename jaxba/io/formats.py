@@ -25,20 +25,11 @@ Writer = Callable[[BundleProblem, StrPath], None]
 class Format:
     """A format of single files."""
 
-    name: str
-    """What messages call it."""
-
-    endings: tuple[str, ...]
-    """Lower-case endings of its files, without that of compression; the first is the one to recommend."""
-
-    read: Reader | None = None
-    """Reader; None if it is only written."""
-
-    write: Writer | None = None
-    """Writer; None if it is only read."""
-
-    begins: tuple[bytes, ...] = ()
-    """First bytes of its files after blanks, by which a file without a known ending is recognised."""
+    name: str  # what messages call it
+    endings: tuple[str, ...]  # of its files, lower case, without compression; the first is the one to recommend
+    read: Reader | None = None  # reader; None if it is only written
+    write: Writer | None = None  # writer; None if it is only read
+    begins: tuple[bytes, ...] = ()  # first bytes after blanks, by which a file without a known ending is recognised
 
 
 def _read_nvm(path: StrPath) -> BundleProblem:
@@ -155,8 +146,7 @@ def read(path: StrPath) -> BundleProblem:
 
 
 def recognised(path: StrPath, begin: bytes) -> str | None:
-    """What a file is that no reader reads, by its name and its first bytes, decompressed, as part of a message; None if
-    it may be a text of a format here."""
+    """What an unread file is, by name and first bytes, as part of a message; None if it may be of a format here."""
     place = Path(path)
     beside = any(
         (place.parent / f"{part}{place.suffix}").is_file() for part in (*PARTS, *RIG_PARTS) if part != place.stem
@@ -172,8 +162,7 @@ def recognised(path: StrPath, begin: bytes) -> str | None:
 
 
 def writer(path: StrPath) -> Writer:
-    """What writes a file of a name. Raises ProblemError: the ending is that of a format that is not written; one line
-    with the endings that are."""
+    """What writes a file of a name. Raises ProblemError: a format that is not written; names those that are."""
     known = by_ending(path)
     write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
     if write is None:
@@ -181,12 +170,6 @@ def writer(path: StrPath) -> Writer:
         name = display_name(path)
         raise ProblemError(f"cannot write {name}: files{of} with {ending(path)} are not written; {formats_written()}")
     return write
-
-
-def holds_bal_only(path: StrPath) -> bool:
-    """Whether a file of this name holds cameras of BAL only."""
-    known = by_ending(path)
-    return known is None or known.name != "PLY"
 
 
 def holds_problem(path: StrPath) -> bool:

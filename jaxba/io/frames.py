@@ -20,20 +20,11 @@ from jaxba.problem.bundle_problem import ProblemError
 class Calibration:
     """A pinhole camera without distortion, as rectified images have it."""
 
-    fx: float
-    """Focal length in pixels, horizontally."""
-
-    fy: float
-    """The same, vertically."""
-
-    cx: float
-    """Principal point in pixels relative to the centre of the first pixel, to the right."""
-
-    cy: float
-    """The same, downwards."""
-
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of camera 0 in the frame of this camera, metres: `K^-1` times the last column of `P`."""
+    fx: float  # focal length in pixels, horizontally
+    fy: float  # the same, vertically
+    cx: float  # principal point in pixels from the centre of the first pixel, to the right
+    cy: float  # the same, downwards
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # camera 0 in this camera's frame, metres: `K^-1 P[:, 3]`
 
     def rays(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Directions `(X / Z, Y / Z)` of pixels; x to the right, y down, z forward."""
@@ -44,18 +35,14 @@ class Calibration:
 class Sidecar:
     """Data of a problem that are not in its arrays."""
 
-    frames: tuple[int, ...]
-    """Frame number of every camera."""
-
-    calibration: Calibration
-    """Calibration of the images."""
+    frames: tuple[int, ...]  # frame number of every camera
+    calibration: Calibration  # calibration of the images
 
 
 def poses_of(poses: Poses, numbers: tuple[int, ...], calibration: Calibration) -> Float[np.ndarray, "frames 3 4"]:
     """Camera-to-world poses of this camera at the frames with these numbers.
 
-    The centre of camera 0 is at `offset` in the frame of this camera, so their paths differ. Raises ProblemError: a
-    frame has no pose."""
+    The centre of camera 0 is at `offset` in the camera's frame: paths differ. Raises ProblemError: no pose."""
     there = np.isin(numbers, poses.numbers)
     if not there.all():
         raise ProblemError(f"{poses.name}: has {len(poses.numbers)} poses, none for frame {numbers[there.argmin()]}")

@@ -1,7 +1,6 @@
 """Files of one JSON object per line, as dataclasses of numbers, texts, tuples and further dataclasses.
 
-JSON has no NaN and no infinity: a number that is not finite is written as null, and null is read as NaN. A killed run
-leaves at most an incomplete last line.
+Numbers that are not finite are written as null, which is read as NaN. A killed run leaves half a line at most.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], data: Any, path: str = "") -> T:
-    """The inverse of `plain` for a dataclass. Unknown keys are ignored. Raises ProblemError: a key is missing, or its
-    value has the wrong type."""
+    """The inverse of `plain`; ignores unknown keys. Raises ProblemError: a key is missing or of a wrong type."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)
@@ -79,9 +77,8 @@ def _value(kind: Any, value: Any, path: str) -> Any:
 
 
 def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
-    """All lines of a file, in order. Empty lines are skipped; an incomplete last line is ignored with a warning in the
-    log. Raises ProblemError: the file cannot be read, or another line is malformed; the message names the file and
-    the line."""
+    """All lines of a file, in order. Skips empty lines and, with a warning in the log, an incomplete last one. Raises
+    ProblemError: unreadable, or another malformed line; names file and line."""
     try:
         lines, found = Path(path).read_bytes().split(b"\n"), []
     except OSError as error:

@@ -22,8 +22,7 @@ LEAST_PIXELS = 16
 
 
 def report(notes: Iterable[str], *, strict: bool = False) -> None:
-    """Warns of each note, one line each, or refuses the problem with the first one if `strict`. Raises ProblemError:
-    the first note, if `strict`."""
+    """Warns of each note in one line. Raises ProblemError: the first note, if `strict`."""
     for text in notes:
         if strict:
             raise ProblemError(text)
@@ -32,8 +31,7 @@ def report(notes: Iterable[str], *, strict: bool = False) -> None:
 
 @contextmanager
 def notes_to(tell: Callable[[str], object]) -> Iterator[None]:
-    """Hands the notes of everything that is read inside to a function, at once and each time; other warnings are shown
-    as before."""
+    """Hands the notes of all that is read inside to a function, at once and each time; shows other warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", ProblemWarning)
         show = warnings.showwarning
@@ -65,16 +63,14 @@ def note(path: StrPath, text: str) -> None:
 
 
 def note_unused(path: StrPath, counts: Mapping[str, int]) -> None:
-    """Warns in one line of what a file holds and no reader uses, such as priors: how many there are, by what they are
-    called."""
+    """Warns in one line of what a file holds and no reader uses, such as priors: how many, by their names."""
     there = [f"{what} ({count})" for what, count in counts.items() if count]
     if there:
         note(path, f"not used: {', '.join(there)}")
 
 
 def note_center(path: StrPath, what: str, center: tuple[float, float], size: tuple[float, float]) -> None:
-    """Warns if a principal point, in pixels from the corner of the image, lies at the edge of its image or outside.
-    `what` says whose it is, such as `camera 3`."""
+    """Warns if a principal point, pixels from the corner, is not inside its image. `what` is its camera."""
     if any(not EDGE * extent <= at <= (1 - EDGE) * extent for at, extent in zip(center, size, strict=True)):
         shown = f"({center[0]:g}, {center[1]:g}) of {size[0]:g} x {size[1]:g} pixels"
         note(path, f"the principal point of {what} lies at the edge of the image: {shown}; is the calibration its own?")

@@ -23,22 +23,14 @@ from jaxba.problem.geometry import are_rotations
 class Poses(NamedTuple):
     """Camera-to-world poses of frames."""
 
-    numbers: Int[np.ndarray, " frames"]
-    """Number of each frame, ascending."""
-
-    matrices: Float[np.ndarray, "frames 3 4"]
-    """`[R | c]` of each, metres."""
-
-    name: str
-    """Of the file, for messages."""
-
-    one_a_line: bool = True
-    """Whether the lines of the file are the frames, so that none can be missing before the last."""
+    numbers: Int[np.ndarray, " frames"]  # number of each frame, ascending
+    matrices: Float[np.ndarray, "frames 3 4"]  # `[R | c]` of each, metres
+    name: str  # of the file, for messages
+    one_a_line: bool = True  # whether lines are frames, so that none can be missing before the last
 
 
 def read_poses(path: StrPath) -> Poses:
-    """Poses of camera 0, camera to world, in metres. Raises ProblemError: the file cannot be read, a line is malformed
-    or holds no rotation, or a frame comes twice."""
+    """Poses of camera 0 to world, metres. Raises ProblemError: unreadable, malformed, no rotation, or a frame twice."""
     name = display_name(path)
     lines = lines_of(Path(path))
     if not lines:
@@ -70,15 +62,13 @@ def read_poses(path: StrPath) -> Poses:
 
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
-    """Lines of a text file that are not blank, each with its number from 1. Raises ProblemError: the file cannot be
-    read, or is no text."""
+    """Lines of a file that are not blank, and their numbers from 1. Raises ProblemError: unreadable, or no text."""
     text = read_characters(path)
     return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
 def numbers_of(text: str, count: int, where: str) -> np.ndarray:
-    """The finite numbers of a line, shape (count,). Raises ProblemError: there are not so many, or one is none; the
-    message begins with `where`."""
+    """The finite numbers of a line, shape (count,). Raises ProblemError, beginning with `where`: not so many."""
     numbers = finite_numbers(text.split(), [f"number {at}" for at in range(1, len(text.split()) + 1)], where)
     if len(numbers) != count:
         raise ProblemError(f"{where}: has {len(numbers)} numbers instead of {count}")

@@ -49,8 +49,7 @@ def shown_word(word: bytes) -> str:
 
 
 def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
-    """The words as finite numbers. `fields` say what each of them is, and `where` begins the messages. Raises
-    ProblemError: a word is no number, or not finite."""
+    """Words as finite numbers; `fields` are their names. Raises ProblemError, beginning with `where`: one is not."""
     found = []
     for word, field in zip(words, fields, strict=True):
         text = word if isinstance(word, str) else word.decode("latin-1")
@@ -124,8 +123,7 @@ class Text:
             self.fail(count, "is left over after the last number", field="")
 
     def integers(self, ordinals: Sequence[int] | np.ndarray, low: int, high: int) -> np.ndarray:
-        """The numbers at some ordinals as int32, after a check that they are integers in `[low, high]`. Raises
-        ProblemError: one of them is not."""
+        """The numbers at some ordinals as int32. Raises ProblemError: one is no integer in `[low, high]`."""
         values = self.values[ordinals]
         whole = values == np.floor(values)
         bad = np.flatnonzero(~(whole & (values >= low) & (values <= high)))

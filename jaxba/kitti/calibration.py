@@ -35,8 +35,7 @@ def calibration_files(folder: Path) -> list[Path]:
 
 
 def read_calibration(path: StrPath, camera: int = 0) -> Calibration:
-    """Calibration of a camera from a file, or from the folder of a sequence. Raises ProblemError: there is none, or it
-    is malformed."""
+    """Calibration of a camera from a file or a sequence's folder. Raises ProblemError: none, or malformed."""
     place: Path | None = Path(path)
     if place.is_dir():
         place = next((one for one in calibration_files(place) if one.is_file()), None)

@@ -24,8 +24,7 @@ def score(
     truth: Float[np.ndarray, "cameras 3 4"],
     lengths: tuple[float, ...] = trajectory_errors.DEVKIT_LENGTHS,
 ) -> dict[str, Any]:
-    """All errors of a trajectory after its alignment, in metres and degrees; see `trajectory_errors`. Raises
-    ProblemError: it cannot be aligned."""
+    """A trajectory's errors after alignment, metres and degrees (`trajectory_errors`). Raises ProblemError."""
     similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
     aligned = similarity.poses(poses)
     translation, rotation = trajectory_errors.relative_errors(aligned, truth)

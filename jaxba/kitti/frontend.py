@@ -61,9 +61,8 @@ def build(
 def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tuple[int, ...]]:
     """Tracks over the frames that are linked with the first one, and the positions of these in the sequence.
 
-    The images of the tracks are positions among them. A frame that cannot be linked with one of the `reach` frames
-    before it is left out; too many such frames in a row are an error. Raises ProblemError: an image cannot be read, or
-    frames cannot be linked: the message names them."""
+    The images of the tracks are positions among them. A frame not linked with one of the `reach` before it is left out.
+    Raises ProblemError: an image cannot be read, or too many frames in a row are not linked: the message names them."""
     read, calibration = image_reader(sequence), sequence.calibration
     recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
     pixels: list[np.ndarray] = []

@@ -15,8 +15,7 @@ from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import perspective
 
 PARALLAX = 10.0
-"""Median parallax in pixels from which on `auto` makes a frame a key-frame. VINS-Mono (Qin et al. 2018) uses 10 at a
-focal length of 460 pixels."""
+"""Median parallax in pixels of a key-frame of `auto`. VINS-Mono (Qin et al. 2018): 10 at focal length 460."""
 
 SHARE = 0.5
 """... as it does when less than this share of the tracks of the last key-frame is left."""

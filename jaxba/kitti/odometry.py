@@ -2,8 +2,7 @@
 
 The relative pose of two views with enough parallax comes from an essential matrix, and their tracks are triangulated.
 The pose of every other view comes from the known points that it sees (PnP), and new points are triangulated as soon as
-the angle between their rays is large enough. The first baseline has length 1. Nothing is adjusted afterwards, so errors
-accumulate.
+the angle between their rays is large enough. The first baseline has length 1. Nothing is adjusted afterwards.
 """
 
 from __future__ import annotations
@@ -50,8 +49,7 @@ PNP_PIXELS = 3.0
 PNP_ITERATIONS = 300
 
 FARTHEST = 1e9
-"""Depth in baselines up to which points are used to choose the motion that has them in front. With OpenCV's 50, a slow
-drive has none."""
+"""Largest depth in baselines of points that choose the motion. With OpenCV's 50, a slow drive has none."""
 
 MIN_KNOWN = 3
 """Known points that the length of a step needs: the median of three tolerates one outlier."""
@@ -173,8 +171,7 @@ def visual_odometry(
 def _bootstrap(scene: _Scene, views: int, names: tuple[int, ...]) -> tuple[int, int, _Motion]:
     """The first two views and their motion: the best pair of the first view that has a good one.
 
-    A good pair has many inlier points and enough parallax; the best one has the largest product of both. If there is no
-    good pair, the best of all pairs is used.
+    A good pair has many inliers and enough parallax; the best one, by their product, of these or else of all.
     """
     found: list[tuple[bool, float, int, int]] = []
     motions: dict[tuple[int, int], _Motion] = {}

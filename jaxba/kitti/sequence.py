@@ -28,17 +28,10 @@ CAMERAS = range(4)
 class Sequence:
     """Some frames of a sequence."""
 
-    folder: Path
-    """Where the images are."""
-
-    numbers: tuple[int, ...]
-    """Number of each frame, ascending: the line of the poses' file, from 0."""
-
-    images: tuple[Path, ...]
-    """File of each frame."""
-
-    calibration: Calibration
-    """Of all frames."""
+    folder: Path  # where the images are
+    numbers: tuple[int, ...]  # number of each frame, ascending: the line of the poses' file, from 0
+    images: tuple[Path, ...]  # file of each frame
+    calibration: Calibration  # of all frames
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -16,14 +16,9 @@ from scipy.sparse.csgraph import connected_components
 class Tracks:
     """A table of observations, sorted by track and then by image; no track has two in one image."""
 
-    image: Int[np.ndarray, " n"]
-    """Image of each observation: an index into a list of images."""
-
-    track: Int[np.ndarray, " n"]
-    """Track of each observation, numbered from 0 without gaps."""
-
-    pixels: Float[np.ndarray, "n 2"]
-    """Pixels relative to the centre of the first one, x to the right, y down."""
+    image: Int[np.ndarray, " n"]  # image of each observation: an index into a list of images
+    track: Int[np.ndarray, " n"]  # track of each observation, numbered from 0 without gaps
+    pixels: Float[np.ndarray, "n 2"]  # from the centre of the first pixel, x to the right, y down
 
     @property
     def count(self) -> int:

@@ -58,8 +58,7 @@ def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
 def segment_errors(aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS) -> SegmentErrors | None:
     """Errors over segments of the true path, per metre; None if the path is too short for all of them.
 
-    A segment of length L starts at every tenth pose and ends at the first one whose distance along the true path
-    is larger by more than L.
+    A segment of length L goes from every tenth pose to the first that is more than L farther along the true path.
 
     Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`).
     """

@@ -118,8 +118,7 @@ def triangulate_robustly(
 
     Points are triangulated once more without the observations whose errors are too large.
 
-    A point needs `min_views` observations with errors of at most `error`, in units of the focal length, and two rays
-    with an angle of `angle` degrees between them.
+    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees apart.
     """
     first = triangulate(views, observations)
     points, keep = first.points, (first.error <= error) & (first.depth > 0)

@@ -65,9 +65,8 @@ def _lower_cholesky_jvp(matrix: tuple[Array], change: tuple[Array]) -> tuple[Arr
 
 
 def factor_and_solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solves `A x = b` for a symmetric positive definite matrix, of which only the lower triangle is read, after Jacobi
-    scaling; `right` is `b`, or several as columns. The solution is non-finite if the matrix is not positive
-    definite."""
+    """Solves `A x = b` for a symmetric positive definite matrix, by its lower triangle, after Jacobi scaling; `right`
+    is `b`, or several as columns. Non-finite if the matrix is not positive definite."""
     scale = lax.rsqrt(jnp.diagonal(matrix))
     scaled = matrix * scale[:, None] * scale
     rows = scale if right.ndim == 1 else scale[:, None]
@@ -84,9 +83,8 @@ def _lapack_solve(matrix: Array, right: Array) -> Array:
 
 
 def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Panels:
-    """Left-looking Cholesky factorisation: each panel first subtracts the products of all earlier ones. The matrix is
-    symmetric with a diagonal near one; only its lower triangle is read. `least` is the fewest columns of a panel;
-    `PANEL` if None."""
+    """Left-looking Cholesky factorisation: each panel first subtracts all earlier products. The matrix is symmetric,
+    its diagonal near one; its lower triangle is read. `least` is the fewest columns of a panel; `PANEL` if None."""
     n = matrix.shape[0]
     width = max(least or PANEL, -(-n // MAX_PANELS))
     inverses, belows = [], []
@@ -107,8 +105,7 @@ def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Pane
 def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
 
-    Not by LAPACK: a batch of such calls inside nested loops deadlocked on a CPU (jax 0.10.2, two threads, 64 scenes of
-    10 cameras).
+    Not by LAPACK: batched calls in nested loops deadlocked on a CPU (jax 0.10.2, two threads, 64 scenes).
     """
 
     def eliminate(k: Array, table: Array) -> Array:

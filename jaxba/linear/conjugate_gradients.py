@@ -36,8 +36,7 @@ def conjugate_gradients(
     max_iterations: int,
 ) -> tuple[Float[Array, "..."], Int[Array, ""]]:
     """Solves `A x = b` from `x = 0` for a symmetric positive definite operator. Returns the iterate and the number of
-    iterations. Negative curvature stops with the last iterate. A non-finite number makes the result non-finite, and the
-    caller rejects the step.
+    iterations. Negative curvature stops with the last iterate. A non-finite number makes the result non-finite.
 
     Args:
         apply: `A`.

@@ -34,9 +34,8 @@ def in_full(layout: Layout) -> bool:
 
 
 def factored(system: DampedSystem, *, rough: bool = False) -> Solve:
-    """`T (T^T S T)^-1 T^T`. Its result is non-finite if S is not positive definite. The system is B + D_c and what is
-    eliminated. `rough` is for a preconditioner in float32: the diagonal is scaled to one and shifted, so that the
-    factor exists."""
+    """`T (T^T S T)^-1 T^T`; non-finite if S is not positive definite. The system is B + D_c and what is eliminated.
+    `rough` is for a preconditioner in float32: the diagonal is scaled to one and shifted, so that the factor exists."""
     layout, unknowns = system.layout, system.layout.unknowns
     if _by_woodbury(layout):
         wide = dense_coupling(system)

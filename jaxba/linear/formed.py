@@ -62,8 +62,7 @@ def pair_products(
     pairs: PairLayout, rows: Float[Array, "items three_width"], width: int
 ) -> Float[Array, "blocks square"]:
     """`sum Y_left Y_right^T` for every block of the lower triangle; the last block is zero. `pairs` says which rows are
-    multiplied into which block, `rows` are `Y^T` [3, width] of every observation, flattened, and `width` is the number
-    of rows and columns of a block."""
+    multiplied into which block, `rows` are `Y^T` [3, width] of every observation, flattened."""
 
     def batch(parts: tuple[Array, Array, Array]) -> Array:
         *sides, sums = parts

@@ -142,8 +142,7 @@ def camera_system(
 ) -> CameraSystem:
     """B + D_c, g_c and b of every camera.
 
-    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b in its columns: one pass over
-    the observations for all three.
+    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b: one pass for all.
     """
     solved = take(jnp.stack(points.solved), layout.slot_point)
     rows = []

@@ -43,8 +43,7 @@ SHIFT = 64.0
 cluster has one camera: it has a column more than unknowns."""
 
 COARSE_PANEL = 256
-"""Columns of a panel of the coarse factorisation. Measured with 1280 unknowns: steps as fast as with panels of 128,
-within 2%, and a second less of compilation."""
+"""Columns of a panel of the coarse factor. With 1280 unknowns as fast as 128, a second less of compilation."""
 
 
 def camera_modes(

@@ -43,8 +43,7 @@ def solve_step(
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
 ) -> Step:
-    """Solves `(H + D) d = -g` for cameras and points. The step is non-finite if a factorisation failed; the caller
-    rejects such a step.
+    """Solves `(H + D) d = -g` for cameras and points. The step is non-finite if a factorisation failed.
 
     Args:
         layout: the problem's observations; must list pairs if the options form the reduced camera system.
@@ -90,8 +89,7 @@ def _slope_and_damping(
 
         m(0) - m(d) = -g.d - d.H d / 2 = (d.D d - g.d + d.e) / 2.
 
-    `d.e` is zero for a factorisation, and for conjugate gradients started at zero. The two terms that are left are
-    positive.
+    `d.e` is zero for a factorisation, and for conjugate gradients from zero. The other two terms are positive.
     """
     points, cameras = system.points, system.cameras
     of_points = jnp.sum(jnp.stack(points.gradient) * point_step), jnp.sum(jnp.stack(points.damping) * point_step**2)

@@ -39,8 +39,7 @@ class StepMethod(MethodTraits, ABC):
 
     @abstractmethod
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
-        """The camera step of the damped system, and the point step if the method computes it too; the options are
-        static."""
+        """The camera step of the damped system, and the point step if the method has it; the options are static."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ def method_of(options: StepOptions) -> StepMethod:
 
 
 def check_plain(options: StepOptions, error: type[ValueError] = ValueError, **asked: bool) -> None:
-    """Refuses another method than plain LM for what only plain LM has, by an error of this kind; `asked` says which
-    keys of `PLAIN_ONLY` a problem or a solve has."""
+    """Refuses what only plain LM has, by an error of this kind; `asked` says which keys of `PLAIN_ONLY` there are."""
     for what, wanted in asked.items():
         if wanted and options.method:
             raise error(PLAIN_ONLY[what].format(options.solver_name))

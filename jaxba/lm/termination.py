@@ -23,12 +23,10 @@ DAMPING_LIMIT = 1e32
 """A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
 
 MAX_UNDAMPED_RATIO = 100.0
-"""A small decrease, or a short step, counts as convergence only if the same without damping is estimated at no more
-than this many times as large."""
+"""A small decrease or short step is convergence only if, undamped, it is at most so many times as large."""
 
 FRACTION_ROUNDING = 64.0
-"""Machine epsilons within which a damping fraction counts as one: with lambda = 1e30 it was computed as 1 or just
-below."""
+"""Machine epsilons within which a damping fraction is one: with lambda = 1e30 it was computed just below."""
 
 
 LEFT_BY_DAMPING, LEAST_LEFT, MOST_LEFT = 3000.0, 0.01, 300.0
@@ -106,8 +104,7 @@ class Tolerances(NamedTuple):
 
 
 def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:
-    """How far a cost is above the one at which the solve would end, relative to it: an estimate that is seldom too
-    small, infinite after a rejected or shortened step.
+    """Relative distance of a cost to that of the end, seldom too small; infinite after a rejected or shortened step.
 
     What is left to do after a step is what damping kept it from doing. Where damping has no share of it (the fraction
     is zero), next steps decrease the cost by far less than this one; in a flat valley, where it has, by as much for
@@ -133,8 +130,7 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
     """Whether a step was rejected whose predicted decrease is below the rounding error of the cost.
 
     Such a rejection says nothing about the step, and the next steps, damped more, predict even less. In float64 this is
-    far below useful tolerances. In float32 it happens before `ftol` is met, which would then need a step that is
-    accepted by luck.
+    far below useful tolerances. In float32 it happens before `ftol` is met.
     """
     rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
     known = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not report rejected steps (peers/driven.py)

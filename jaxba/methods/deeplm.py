@@ -1,8 +1,7 @@
 """DeepLM's global solver (`deeplm`): conjugate gradients on the normal equations `(H + D) d = -g`, without elimination.
 
 Cameras and points are solved for together, preconditioned by their 9 x 9 and 3 x 3 diagonal blocks. A product takes two
-passes over the observations. No block of the reduced camera system is formed, so that memory is linear in the number of
-observations.
+passes over the observations. No reduced camera system is formed: memory is linear in the observations.
 
 Source: Huang et al. 2021, "DeepLM: Large-scale Nonlinear Least Squares on Deep Learning Frameworks using Stochastic
 Domain Decomposition", and the authors' code. Two differences: the authors divide the columns of J by `1 + |J_j|` before

@@ -39,8 +39,7 @@ from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, take_each, take_rows, tree_sum
 
 MIN_CONSENSUS_DAMPING = 1.0
-"""Smallest lambda for which the gradients of replicas are made to agree. Source: the authors' code (radius at most
-1)."""
+"""Smallest lambda for which gradients of replicas agree. Source: the authors' code (radius at most 1)."""
 
 
 SplitSystem: TypeAlias = tuple[list[list[Array]], list[Array]]

@@ -48,8 +48,7 @@ class Frames(NamedTuple):
     def at(self, index: Int[AnyArray, " n"]) -> Frames:
         """The frames of the cameras in `index`.
 
-        They are computed once per camera and stored: a fusion barrier keeps XLA from recomputing the rotation matrices
-        for every index.
+        Computed once per camera: a fusion barrier keeps XLA from computing rotations again for every index.
         """
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
         rows = [row for place in self.places for row in place]

@@ -139,8 +139,7 @@ def linearize(
 
 
 def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
-    """Whether the loss gives weight to no observation though there is a cost: gradient and Hessian are zero, and
-    nothing says where to go."""
+    """Whether the loss gives weight to no observation though there is a cost: gradient and Hessian are zero."""
     if loss.trivial:
         return jnp.zeros((), bool)
     first, second = linear.residual

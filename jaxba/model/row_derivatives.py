@@ -67,8 +67,7 @@ def differentiated(
 
 
 def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Array]:
-    """The numbers of `Differentiated`. Raises NotImplementedError: there is no rule for something in the function, or
-    it is too large."""
+    """The numbers of `Differentiated`. Raises NotImplementedError: no rule for something in it, or too large."""
     over_rows = given[3].ndim - 2
     numbers = [numbers_of(x, x.ndim - over_rows) for x in given]
     function, parameters = Traced(functools.partial(_value, rows, unknowns), *numbers), numbers[:4]
@@ -120,8 +119,7 @@ def _weighted(
     own: Numbers,
     by_point: Numbers,
 ) -> list[Array]:
-    """The numbers of `Differentiated`, for the derivatives of residuals by rotation matrices, translations and numbers
-    of cameras, and by points."""
+    """The numbers of `Differentiated`, for derivatives by rotations, translations, numbers of cameras, points."""
     # R <- R + [w]x R changes the residual by w . sum of R_j x dr/dR_j over columns j
     turn = _cross(given[0], turn, -2).sum(axis=-1)
     if unknowns.in_rigs:  # R = M R_f and t = M t_f + m, with steps of frames and of M and m

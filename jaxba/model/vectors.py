@@ -72,8 +72,7 @@ class Traced:
         self.size = _size(self._closed)
 
     def __call__(self, *operands: Numbers) -> Numbers:
-        """Its numbers for all rows, whose vectors are of one shape. Raises NotImplementedError: the function does
-        something for which there is no rule here."""
+        """Its numbers for all rows, of one shape. Raises NotImplementedError: no rule for an operation."""
         (found,) = _evaluated(self._closed, operands)
         return found
 

@@ -42,20 +42,11 @@ BASELINES = ("ceres",)
 class Agent:
     """One kind of agent."""
 
-    name: str
-    """Name in records and folders."""
-
-    preset: str = "paper-tuned"
-    """Of `jaxba-train`."""
-
-    overrides: tuple[str, ...] = ()
-    """Settings (`key=value`) that differ from the preset."""
-
-    few_scenes: bool = False
-    """Whether it is trained on as few scenes as the paper's agent."""
-
-    problems: tuple[str, ...] = ()
-    """Files of real problems, on windows of which it is trained; on the synthetic scenes if empty."""
+    name: str  # in records and folders
+    preset: str = "paper-tuned"  # of `jaxba-train`
+    overrides: tuple[str, ...] = ()  # settings (`key=value`) that differ from the preset
+    few_scenes: bool = False  # whether it is trained on as few scenes as the paper's agent
+    problems: tuple[str, ...] = ()  # files of real problems, on windows of which it is trained, if any
 
 
 OURS = Agent("agent")
@@ -68,12 +59,10 @@ BEST = Agent("agent-guarded", "default")
 """The best agent for lambda alone: scale-free observations, and the guard."""
 
 SECONDS = 5.5
-"""Mean duration of an iteration by the clock, against a bonus of 10. Source: the paper's table on BAL, 110 s of 20
-iterations of classic."""
+"""Mean duration of an iteration, against a bonus of 10. Source: the paper's table on BAL, 110 s in 20 of classic."""
 
 BY_THE_CLOCK = ("game.reward=clock", f"game.scale={0.1 * SECONDS}", f"game.bonus={10 / SECONDS}")
-"""Reward of minus the duration in seconds, and a bonus of 10, times the tenth of the preset: the scale is a factor on
-both."""
+"""Minus the duration in seconds, and a bonus of 10, both times the preset's tenth."""
 
 FEW = replace(OURS, name="agent-ten", few_scenes=True)
 REDUCTION = replace(OURS, name="agent-reduction", overrides=("game.reward=reduction",))
@@ -81,13 +70,11 @@ CLOCK = replace(OURS, name="agent-clock", overrides=BY_THE_CLOCK)
 REVERSED = replace(OURS, name="agent-reversed", overrides=("game.reward=reversed", "game.agent.observation=duration"))
 
 WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[200]", "bank.refine_points=3")
-"""Windows of an agent that is trained on real problems. Ten points, as in the synthetic scenes, would leave most
-cameras of a window with too few observations."""
+"""Windows of agents for real problems. With ten points, most cameras would have too few observations."""
 
 
 def trained_elsewhere(config: PaperConfig, source: Source, kind: Agent, method: str = "lm") -> Agent | None:
-    """The agent for a real problem, trained on other ones (`real_problems.training_files`) with the steps of a method;
-    None if there are none."""
+    """The agent for a real problem, trained on others (`real_problems.training_files`) with a method; None without."""
     left_out, files = real_problems.training_files(config.real, source)
     if not files:
         return None
@@ -104,8 +91,7 @@ def with_state_size(size: int) -> Agent:
 
 
 def train_config(config: PaperConfig, agent: Agent) -> TrainConfig:
-    """Configuration of the training of an agent: all training runs side by side, on the scenes of the paper's game.
-    Raises SettingsError: an override is invalid."""
+    """Configuration of an agent's training runs on the paper's game. Raises SettingsError: an invalid override."""
     changes = (*config.agents.overrides, *agent.overrides, f"seeds={config.agents.seeds}", f"seed={config.seed}")
     found = train_configs.load(agent.preset, changes)
     bank = train_configs.load(OURS.preset, changes).bank
@@ -125,9 +111,8 @@ def own_folder(agent: Agent, folder: Path) -> Path:
 
 
 def train(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> bool:
-    """Trains an agent if the folder of the reproduction run does not have its policies yet; `report` is called with a
-    line of text when something starts. Returns whether it was trained by this call. Raises InputError: the training
-    cannot start or continue; the message is one line."""
+    """Trains an agent whose policies the run's folder lacks; `report` is called with a line when something starts.
+    Returns whether it did. Raises InputError: the training cannot start or continue; one line."""
     own = own_folder(agent, folder)
     files = [own / POLICY.format(seed + 1) for seed in range(config.agents.seeds)]
     if all(file.is_file() for file in files):

@@ -58,25 +58,15 @@ class Claim(NamedTuple):
 class Statement(NamedTuple):
     """A claim before it is tested: the rule, the claim in words, the paper's number, and the methods."""
 
-    test: Callable[..., Claim]
-    """`ratio_claim`, `time_claim`, `longer_claim`, `order_claim` or `success_claim`."""
-
-    text: str
-    """In words; `{}` stands for the set of problems."""
-
-    paper: Any
-    """The paper's number, as the test takes it."""
-
-    ours: str
-    """Method that the claim is about."""
-
-    base: str = ""
-    """Method that it is compared with; none for `success_claim`."""
+    test: Callable[..., Claim]  # a function of this module such as `ratio_claim`
+    text: str  # in words; `{}` stands for the set of problems
+    paper: Any  # the paper's number, as the test takes it
+    ours: str  # method that the claim is about
+    base: str = ""  # method that it is compared with; none for `success_claim`
 
 
 def judge(statements: Iterable[Statement], row: Callable[[str], Row | None], where: str = "") -> tuple[Claim, ...]:
-    """Tests claims on the set of problems that is called `where`; `row` gives the row of a method by name, None if it
-    was not run."""
+    """Tests claims on the problems called `where`; `row` gives a method's row by name, None if it was not run."""
     return tuple(
         one.test(one.text.format(where), one.paper, *(row(name) for name in (one.ours, one.base) if name))
         for one in statements
@@ -154,8 +144,7 @@ def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
 
 
 def error_claim(text: str, paper: float, excess: Sequence[float]) -> Claim:
-    """The claim that an error is larger by less than `paper` on every problem; `excess` is by how much ours is larger,
-    for each."""
+    """The claim that an error is larger by less than `paper` on every problem; `excess` is how much ours is."""
     if not excess:
         return Claim(text, f"< {paper:g}", "-", "not run")
     within = sum(x < paper for x in excess)

@@ -26,17 +26,10 @@ _SUFFIXES = re.compile(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$")
 class Problems:
     """A set of problems of a table."""
 
-    name: str
-    """Name in the report."""
-
-    sources: tuple[Source, ...]
-    """Complete problems, then sub-problems of them."""
-
-    missing: tuple[str, ...] = ()
-    """Entries of the configuration for which no file exists."""
-
-    reason: str = ""
-    """Why there are no problems; empty if there are some."""
+    name: str  # name in the report
+    sources: tuple[Source, ...]  # complete problems, then sub-problems of them
+    missing: tuple[str, ...] = ()  # entries of the configuration for which no file exists
+    reason: str = ""  # why there are no problems; empty if there are some
 
 
 def find(config: FamilyConfig) -> Problems:

@@ -76,8 +76,7 @@ def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
 
 
 def _figures(runner: Runner, command: str) -> str:
-    """The page of the figures: of several problems their performance profiles, of a single one its convergence and
-    lambdas. Empty if nothing of them was run."""
+    """The page of figures: profiles of several problems, convergence and lambdas of one. Empty if none was run."""
     drawn = {
         f"{figure.heading}: {part.problems.name}": records
         for figure in FIGURES

@@ -37,32 +37,15 @@ to a worse cost needs few iterations without being better."""
 class Play:
     """Solves of all scenes of a set with one policy. Tuples have an entry for each scene."""
 
-    scenes: str
-    """Name of the set of scenes."""
-
-    method: str
-    """Name of the policy."""
-
-    seed: int
-    """Number of the training run, from 0; 0 for rules."""
-
-    iterations: tuple[int, ...]
-    """Linear solves."""
-
-    converged: tuple[bool, ...]
-    """Whether the solve converged before the limit of iterations."""
-
-    near: tuple[float, ...]
-    """Linear solves until the cost is within `NEAR` of the best known cost; infinite (null in the file) if never."""
-
-    end: tuple[float, ...]
-    """Final cost relative to the best known cost, minus 1."""
-
-    first: tuple[tuple[float, ...], ...]
-    """First lambdas of each solve."""
-
-    seconds: float
-    """Time for all scenes together, including compilation, and so not a measure of speed."""
+    scenes: str  # name of the set of scenes
+    method: str  # name of the policy
+    seed: int  # number of the training run, from 0; 0 for rules
+    iterations: tuple[int, ...]  # linear solves
+    converged: tuple[bool, ...]  # whether the solve converged before the limit of iterations
+    near: tuple[float, ...]  # linear solves until the cost is within `NEAR` of the best known; infinite (null) if never
+    end: tuple[float, ...]  # final cost relative to the best known cost, minus 1
+    first: tuple[tuple[float, ...], ...]  # first lambdas of each solve
+    seconds: float  # for all scenes, with compilation, and so no measure of speed
 
     def __post_init__(self) -> None:
         for name in ("near", "end"):  # null in the file is read as NaN
@@ -74,8 +57,7 @@ class Store:
     """The results in the folder of a run. Only one process may write at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Reads the existing results. Raises ProblemError: a file is damaged; the message names the file and the
-        line."""
+        """Reads the existing results. Raises ProblemError: a file is damaged; names the file and line."""
         self.folder = folder
         self.solves = _read(folder / SOLVES, Record)
         self.plays = _read(folder / PLAYS, Play)
@@ -139,8 +121,7 @@ class Row(NamedTuple):
 
 
 def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:
-    """The row of a method, from the outcomes on the same problems by training run; a rule has one entry, and none is
-    `trained`."""
+    """A method's row, from outcomes on the same problems by training run; a rule has one, and is not `trained`."""
     every = [outcome for solves in outcomes.values() for outcome in solves]
     if not every:
         return Row(method, *[math.nan] * 6, seeds=0, solves=0)
@@ -166,8 +147,7 @@ def of_play(play: Play) -> list[Outcome]:
 
 
 def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Outcome]:
-    """The outcomes of one method on problems, with the median time of repeats. `best` has the best known cost of each
-    problem."""
+    """A method's outcomes on problems, with the median time of repeats. `best` has each problem's best known cost."""
     found = []
     for name, runs in profile.by_problem(records).items():
         first = runs[0]

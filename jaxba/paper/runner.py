@@ -1,5 +1,4 @@
-"""Runs the solves and trainings of the tables and figures, keeps their results on disk, and makes table rows of
-them."""
+"""Runs the solves and trainings of tables and figures, keeps results on disk, and makes rows of them."""
 
 from __future__ import annotations
 
@@ -106,8 +105,6 @@ class Runner:
         """Number of solves, plays and trainings that this process has done."""
         self._read: tuple[Source, BundleProblem] | None = None
 
-    # Policies
-
     def agent(
         self, kind: Agent, linear: LinearSolverChoice = "auto", method: str = "lm", *, twin: bool = False
     ) -> Method:
@@ -118,8 +115,7 @@ class Runner:
         return self._method(kind.name, lambda _: kind, method, linear=linear, twin=twin)
 
     def elsewhere(self, kind: Agent, method: str = "lm", *, twin: bool = False) -> Method:
-        """The same with agents trained on windows of real problems other than the one to solve. The steps of a peer are
-        those of plain LM."""
+        """The same with agents trained on windows of other real problems. A peer's steps are plain LM's."""
         library = parse_solver(method) if method.partition(":")[0] in PEERS else None
         steps = "lm" if library else method
         find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, steps)
@@ -179,8 +175,6 @@ class Runner:
             self.done += 1
         return net, SolveOptions()
 
-    # Work
-
     @functools.cached_property
     def test_scenes(self) -> Bank:
         """The scenes of the tables, generated when first needed."""
@@ -218,8 +212,7 @@ class Runner:
 
     def solve(self, sources: Iterable[Source], methods: Sequence[Method], limit: int = LIMIT, repeats: int = 0) -> None:
         """Solves problems with methods, except for those whose results the folder has. A problem that cannot be read is
-        reported and skipped. `limit` is that of linear solves, and `repeats` the repeats of each solve; as in the
-        configuration if 0."""
+        reported and skipped. `limit` of linear solves and `repeats` are the configuration's if 0."""
         for source in sources:
             for method in methods:
                 for seed in method.numbers:
@@ -263,8 +256,6 @@ class Runner:
         self.store.add_solve(replace(record, solver=method.label(seed)))
         self.done += 1
 
-    # Rows
-
     def row_on_scenes(self, method: Method) -> Row:
         """The row of a method on the scenes of the tables, from the results so far."""
         plays = [self.store.play(TEST, method.name, seed) for seed in method.numbers]
@@ -297,7 +288,3 @@ class Runner:
         """First lambdas on every scene of the tables, of the method's first training run."""
         known = self.store.play(TEST, method.name, 0)
         return [] if known is None else list(known.first)
-
-    def number_of_scenes(self) -> int:
-        """Number of scenes of the tables, from the results so far."""
-        return max((len(p.iterations) for p in self.store.plays if p.scenes == TEST), default=0)

@@ -38,9 +38,8 @@ def sub_problem(
 def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"]:
     """Cameras with many common points, chosen greedily.
 
-    The first is the camera that observes most points. The next is always the one that shares most points with those
-    already chosen; of equals, the one with the lowest index. Returns sorted indices. Raises ProblemError: the problem
-    has fewer cameras."""
+    The first is the camera that observes most points. The next shares most points with those chosen; of equals, the
+    first. Returns sorted indices. Raises ProblemError: the problem has fewer cameras."""
     if not 1 <= count <= problem.num_cameras:
         raise ProblemError(f"cannot take {count} of {problem.num_cameras} cameras")
     pairs = np.asarray(problem.camera_index), np.asarray(problem.point_index)

@@ -4,8 +4,7 @@ Its input is the same history as the agent's (the last states, actions and rewar
 gradient is that of the cost after one step, through the differentiable `lm_step`. It is trained when a table needs it.
 
 The next cost depends on the network through lambda only, so the gradient is a product of two factors. The derivative of
-the cost with respect to the action is computed in forward mode, one number per scene. A failed factorisation thus
-invalidates one number and not the whole gradient.
+the cost by the action is in forward mode, a number per scene: a failed factorisation spoils only one.
 """
 
 from __future__ import annotations
@@ -67,8 +66,7 @@ class ZeroNet(AgentPolicy):
 
 
 def inputs(memory: Memory) -> Float[Array, " features"]:
-    """Input of the network: last errors, last actions as log10(lambda), and last rewards, which are -1 for an iteration
-    and 0 where there was none yet."""
+    """Input of the network: last errors, actions as log10(lambda), rewards (-1 an iteration, 0 where none was yet)."""
     steps = memory.steps
     return jnp.concatenate([memory.errors, steps[:, _DAMPING], -steps[:, _PRESENT]]).astype(jnp.float32)
 

@@ -1,5 +1,4 @@
-"""Other bundle adjustment libraries that `jaxba-bench` can compare with. Each needs an optional dependency, which is
-imported only by the modules that use it."""
+"""Other libraries that `jaxba-bench` compares with: optional dependencies, imported only where they are used."""
 
 from __future__ import annotations
 
@@ -13,8 +12,7 @@ NEEDS = {"pyceres": ("ceres", ("pyceres", "pycolmap"))}
 
 
 def require(solver: SolverName) -> None:
-    """Checks that the library of a solver is installed. Raises InputError: it is not; the message names the package to
-    install."""
+    """Raises InputError: the library of a solver is not installed; names the package to install."""
     if not solver.peer:
         return
     extra, packages = NEEDS[solver.peer.partition(":")[0]]

@@ -29,8 +29,7 @@ from jaxba.solver.solve import Solution
 _log = logging.getLogger(__name__)
 
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
-"""Ceres' linear solver for each mode. The iterative one uses the preconditioner SCHUR_JACOBI. A mode may end in `INNER`
-for Ceres' inner iterations."""
+"""Ceres' linear solver of a mode; the iterative one with SCHUR_JACOBI. After it `INNER` means inner iterations."""
 
 FORCING = 0.1
 """Forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`."""
@@ -42,8 +41,7 @@ ENDS = {
     "Maximum number of iterations": Termination.MAX_ITERATIONS,
     "Minimum trust region radius": Termination.DAMPING_LIMIT,
 }
-"""Reason to stop for each beginning of Ceres' summary message. Any other message means that Ceres failed, after five
-invalid steps in a row."""
+"""Reason to stop by the beginning of Ceres' message. Any other is a failure, after five invalid steps in a row."""
 
 ENDS_WITHOUT_STEP = (Termination.COST, Termination.STEP)
 """Convergence tests that Ceres makes before it accepts a step, so that the last step is computed but not taken."""
@@ -67,8 +65,7 @@ class Run:
     """A solve in progress: the Ceres problem, the clock and the recorded iterations."""
 
     def __init__(self, problem: BundleProblem, callback: Callback | None) -> None:
-        """Builds the Ceres problem. Raises ProblemError: the initial cost is not finite, or the problem has covariances
-        or shared lenses."""
+        """Builds Ceres' problem. Raises ProblemError: a non-finite initial cost, covariances or shared lenses."""
         self.initial_cost = geometry.cost(problem)
         if not np.isfinite(self.initial_cost):
             raise ProblemError(explain_start(problem))
@@ -89,8 +86,7 @@ class Run:
         self.paused = 0.0
 
     def newly_behind(self) -> Bool[np.ndarray, " observations"]:
-        """Observations whose point has moved behind its camera, so that COLMAP ignores them. The time that this takes
-        is not counted."""
+        """Observations whose point moved behind its camera: COLMAP ignores them. Their time is not counted."""
         now = time.perf_counter()
         behind = geometry.depths(self.colmap.bundle()) < SMALLEST_DEPTH
         self.paused += time.perf_counter() - now
@@ -104,8 +100,7 @@ class Run:
     def record(self, step: StepInfo) -> bool:
         """Records an iteration at the parameters after it, and calls the callback.
 
-        jaxba evaluates the recorded cost; the time of that and of the callback is not counted. Returns whether the
-        callback asked to stop."""
+        Times of jaxba's cost and of the callback are not counted. Returns whether the callback asked to stop."""
         now = time.perf_counter()
         self.total_s = now - self.started - self.paused
         if step.accepted:
@@ -216,18 +211,15 @@ def solve_by_ceres(
 ) -> Solution:
     """Solves with Ceres under its own trust-region rule and convergence tests, with jaxba's tolerances.
 
-    Ceres tests for a small decrease before it accepts a step. That last linear solve is counted here as an iteration
-    whose step is rejected with gain ratio 0.
+    Ceres tests for a small decrease first: that last solve counts as a rejected step with gain ratio 0.
 
     COLMAP gives a point behind its camera a residual of zero. If an accepted step moves a point there, the step is
-    undone and repeated from the same radius with that observation counted. This takes the time of two iterations and
-    counts as one.
+    undone and repeated from the same radius with that observation counted. That counts as one iteration.
 
     In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead of angles).
     `parameter_norm` and `damping_fraction` are NaN. `mode` is a key of `LINEAR_SOLVERS`, followed by `INNER` for Ceres'
-    inner iterations. The target cost is ignored, since Ceres has no such test. `callback` is called after every
-    iteration; a true return value stops the solve. Raises ProblemError: the initial cost is not finite, or the problem
-    has covariances or shared lenses."""
+    inner iterations. The target cost is ignored. `callback` is called after every iteration; a true return value stops
+    the solve. Raises ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses."""
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
     options = solver_options(mode, threads)

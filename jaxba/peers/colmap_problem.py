@@ -34,8 +34,7 @@ class ColmapProblem:
     """
 
     def __init__(self, problem: BundleProblem) -> None:
-        """Copies the parameters; `problem` is not changed. Raises ProblemError: the problem has covariances, lenses,
-        constants, priors or rigs."""
+        """Copies the parameters. Raises ProblemError: covariances, lenses, constants, priors or rigs."""
         parts = problem.whitening, problem.lenses, problem.constants, problem.rigs
         if problem.residuals or any(part is not None for part in parts):
             raise ProblemError("Ceres as a peer takes no covariances, lenses, constants, priors or rigs")
@@ -64,8 +63,7 @@ class ColmapProblem:
         self._residuals[observation] = self.ceres.add_residual_block(self._costs[observation], None, blocks)
 
     def count_behind(self, behind: Bool[np.ndarray, " observations"]) -> int:
-        """Replaces the cost function of observations whose points moved behind their camera. Returns how many were
-        replaced."""
+        """Replaces cost functions of observations of points that moved behind their camera; returns how many."""
         new = np.flatnonzero(behind & ~self.in_python).tolist()
         for observation in new:
             self.ceres.remove_residual_block(self._residuals[observation])

@@ -22,8 +22,7 @@ MOST = 0.75
 """Share of the images that must fit: it is noted if fewer do."""
 
 DOUBTFUL, MISFIT = 2.0, 5.0
-"""Distance of this share, in terms of that of noise alone, from which other axes or units are tried, and from which the
-scene does not fit its positions."""
+"""Distance, over that of noise, from which other axes or units are tried, and from which positions do not fit."""
 
 BETTER, EXPLAINED, LEAST_IMAGES = 0.3, 0.1, 5
 """Other axes or units are taken for the true ones if they leave this share of the misfit, and no more than this share
@@ -144,8 +143,7 @@ def _distances(
 
 
 def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
-    """Refuses positions that fit well with other axes or units, and badly as they are. Raises ProblemError: they are
-    degrees, or mirrored."""
+    """Raises ProblemError: positions fit well with other axes or units only: degrees, or mirrored."""
     if len(centers) < LEAST_IMAGES:
         return
     others = [(positions * [-1, 1, 1], "mirrored: are two axes swapped, or is one reversed?")]

@@ -1,7 +1,6 @@
 """The bundle adjustment problem: parameters, observations, and the checks that they are valid.
 
-All other modules may assume that a `BundleProblem` made by `BundleProblem.create` is finite, has observations, and has
-indices in range.
+A `BundleProblem` made by `BundleProblem.create` is finite, has observations, and indices in range.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ class ProblemError(InputError):
 
 
 class ProblemWarning(UserWarning):
-    """A part of the input was left out of the problem, was mended, or looks wrong. The message is one line for the
-    user."""
+    """A part of the input was left out, was mended, or looks wrong. The message is one line for the user."""
 
 
 @register_pytree
@@ -76,8 +74,7 @@ class BundleProblem(ArrayRecord):
     """`Sigma^(-1/2)` of each observation (1 / pixels); None: the identity."""
 
     lenses: Lenses | None = None
-    """Shared and fixed intrinsics, and camera models; None: every camera has its own BAL lens, and all of it is
-    optimised."""
+    """Shared and fixed intrinsics, and camera models; None: every camera has its own BAL lens, all optimised."""
 
     constants: Constants | None = None
     """Constant poses and points; None: all are optimised."""

@@ -21,8 +21,7 @@ def shown(value: Any, longest: int = SHOWN) -> str:
 
 
 def plain_array(name: str, values: Any) -> np.ndarray:
-    """The values as a NumPy array. Raises ValueError: rows differ in length, or entries are masked. Raises TypeError:
-    JAX traces them."""
+    """A NumPy array. Raises ValueError: rows differ in length, or masked entries. Raises TypeError: JAX traces them."""
     if np.ma.is_masked(values):
         raise ValueError(f"{name} must have no masked entries")
     try:
@@ -34,8 +33,7 @@ def plain_array(name: str, values: Any) -> np.ndarray:
 
 
 def real_numbers(name: str, values: Any) -> np.ndarray:
-    """The values as a contiguous float64 array. Raises ValueError: they are no real numbers, or no array. Raises
-    TypeError: JAX traces them."""
+    """A contiguous float64 array. Raises ValueError: no real numbers, or no array. Raises TypeError: traced."""
     array = plain_array(name, values)
     try:
         if array.dtype.kind in "biufO":

@@ -26,8 +26,7 @@ _OFF_AXIS = np.array([0.1, 0.2, 1.0])
 
 
 def views_behind(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
-    """Observations of points behind their camera; none of lenses that tell such a point from its mirror image, as
-    fisheyes do."""
+    """Observations of points behind their camera; none of lenses that tell it from its mirror image, as fisheyes."""
     return (geometry.depths(problem) <= 0) & _sees_mirrored(problem)[np.asarray(problem.camera_index)]
 
 

@@ -31,8 +31,7 @@ it is a square, and this squared is some rounding errors of float64."""
 
 
 def fixed_freedoms(problem: BundleProblem) -> int:
-    """How many of the seven freedoms of a similarity constants, rigs and residuals fix, of a problem far from the
-    origin as a solve shifts it."""
+    """How many of a similarity's seven freedoms constants, rigs and residuals fix, as a solve shifts the problem."""
     return SIMILARITY - _freedoms(shift(problem, -far_middle(problem)))[0].shape[1]
 
 

@@ -22,12 +22,10 @@ CHUNK = 1 << 19
 """Observations processed at once: some 100 MB of temporaries, measured no slower than larger chunks."""
 
 COLMAP_FLIP = np.array([1.0, -1.0, -1.0])
-"""Signs that take the axes of a BAL camera (looks down -z, y upwards) to those of COLMAP (+z, y downwards), and back.
-The first two are those of pixels."""
+"""Signs from BAL's axes (looks down -z, y upwards) to COLMAP's (+z, y downwards), and back; first two: pixels."""
 
 ROTATION_TOLERANCE = 1e-3
-"""Largest entry of `R R^T - I` of a matrix in a file that still counts as rounding; Bundler writes 11 digits, KITTI 7,
-other programs fewer."""
+"""Largest entry of `R R^T - I` that counts as rounding in a file: Bundler writes 11 digits, KITTI 7, others fewer."""
 
 _HALF_TURN_X = np.array([1.0, 0.0, 0.0, 0.0])
 """The rotation `diag(COLMAP_FLIP)` as a quaternion xyzw."""
@@ -122,8 +120,7 @@ def radial_distortion(square: np.ndarray | float, k1: np.ndarray | float, k2: np
 def pixels(
     problem: BundleProblem, camera: Int[np.ndarray, " n"], local: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Pixels of points in the frames of cameras, in COLMAP's axes (x right, y down, z forwards), by the models of their
-    lenses."""
+    """Pixels of points in cameras' frames, COLMAP's axes (x right, y down, z forwards), by the lenses' models."""
     numbers, lenses = np.asarray(problem.cameras, dtype=np.float64)[:, 6:][camera], problem.lenses
     models = (BAL,) if lenses is None else lenses.models
     own, result = [np.arange(len(camera))], np.empty((len(camera), 2))
@@ -138,8 +135,7 @@ def pixels(
 def project(problem: BundleProblem) -> Float[np.ndarray, "observations 2"]:
     """Predicted pixels of every observation.
 
-    Points behind a camera are projected by the same formula, as BAL does; a point at depth zero gives a result that is
-    not finite."""
+    Points behind a camera are projected by the same formula, as BAL does; depth zero is not finite."""
     predicted = np.empty((problem.num_observations, 2))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for part, camera, local in _camera_frames(problem):

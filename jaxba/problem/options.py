@@ -202,8 +202,7 @@ def check_known(name: str, value: Any, kind: Any) -> None:
 
 
 def check_count(name: str, value: Any, least: int) -> None:
-    """Checks that an option is an integer in [least, `LARGEST_COUNT`]. Raises ValueError: it is not; the message
-    contains its name."""
+    """Raises ValueError: an option is no integer in [least, `LARGEST_COUNT`]; the message contains its name."""
     try:
         count = operator.index(value)
     except TypeError:

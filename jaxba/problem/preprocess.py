@@ -17,9 +17,8 @@ MIN_DEPTH = 0.1
 """Smallest depth of an observation in a scene of that size. Source: rootba's experiments."""
 
 FAR = 10.0
-"""Distance of a scene from the origin, relative to its extent, from which it is shifted to the origin to be solved.
-BAL rotations are about the origin: far from it, small rotations are large motions, which distorts the damping and loses
-digits."""
+"""Distance of a scene from the origin, relative to its extent, from which it is solved around the origin. BAL rotations
+are about the origin: far from it, small rotations are large motions, which distorts the damping and loses digits."""
 
 MIN_TRACK = 2
 """Fewest observations that determine a point. Source: rootba, which drops points with fewer."""
@@ -29,9 +28,8 @@ def normalize(problem: BundleProblem, size: float = SIZE) -> BundleProblem:
     """The same problem in coordinates in which the points are centred and have a given spread.
 
     A similarity moves the marginal median of the points to the origin and scales their median L1 distance from it to
-    `size`, scene units. All residuals, and so the cost, are unchanged. Raises ProblemError: `size` is not positive,
-    there are no points, or half of them coincide. Source: Ceres `BALProblem::Normalize` (its median is the upper one of
-    an even count)."""
+    `size`, scene units. Residuals are unchanged. Raises ProblemError: `size` is not positive, there are no points, or
+    half of them coincide. Source: Ceres `BALProblem::Normalize` (its median is the upper one of an even count)."""
     if not (np.isfinite(size) and size > 0):
         raise ProblemError(f"the size of a normalised scene must be positive, not {size}")
     points = np.asarray(problem.points, dtype=np.float64)
@@ -82,8 +80,7 @@ def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:
-    """The same scene translated by an offset, scene units; all residuals are unchanged. Cameras and points without
-    observations are not moved."""
+    """The same scene translated by an offset, scene units, but for cameras and points without observations."""
     if not np.any(offset):
         return problem
     return transformed(problem, Similarity(1.0, np.eye(3), offset), *observed(problem))
@@ -100,8 +97,7 @@ def perturb(
     not finite. Source: Ceres `BALProblem::Perturb`.
 
     As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held fixed, then translation
-    noise is added to `t = -R c`. rootba adds it to the centre c, which has the same distribution, since the noise is
-    isotropic.
+    noise is added to `t = -R c`. rootba adds it to c: the same distribution.
 
     Args:
         problem: the problem to perturb.
@@ -130,9 +126,8 @@ def perturb(
 def drop_invalid(problem: BundleProblem, min_depth: float = MIN_DEPTH) -> BundleProblem:
     """Removes observations of points nearer than `min_depth` (scene units) in front of their camera or behind it.
 
-    Points with fewer than `MIN_TRACK` remaining observations are removed, and the others are renumbered in order.
-    Cameras keep their indices, even without observations. Raises ProblemError: nothing would be left. Source: rootba
-    `BalProblem::filter_obs`."""
+    Points with fewer than `MIN_TRACK` observations left are removed, the others renumbered. Cameras keep their indices,
+    even without observations. Raises ProblemError: nothing would be left. Source: rootba `BalProblem::filter_obs`."""
     keep = depths(problem) >= min_depth
     point_index = np.asarray(problem.point_index)
     tracks = np.bincount(point_index[keep], minlength=problem.num_points)

@@ -35,8 +35,7 @@ LARGEST_DISAGREEMENT = 1e-6
 class Rigs(ArrayRecord):
     """The frame of each camera of a problem, and its place in the rig.
 
-    A solve then adds rotations on the manifold, and makes no camera rounds and pattern moves, which would take cameras
-    of a frame apart.
+    A solve then adds rotations on the manifold, without camera rounds and pattern moves, which part frames.
     """
 
     frame: Int[AnyArray, " cameras"]

@@ -14,8 +14,7 @@ Poses = Float[np.ndarray, "poses 3 4"]
 """Camera-to-world poses `[R | c]`."""
 
 LEAST_SPREAD = 1e-12
-"""Second singular value of the covariance, as a share of the first, below which the positions lie on a line, so that
-the rotation about it is undetermined."""
+"""Second singular value of the covariance over the first, below which positions lie on a line."""
 
 SAME_LINE = 1e-12
 """Sine of the angle below which two unit vectors are taken to lie on one line."""
@@ -39,8 +38,7 @@ class Similarity(NamedTuple):
 
 
 def upright(problem: BundleProblem) -> Similarity:
-    """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras'
-    upward directions along +z."""
+    """The similarity to a scene around the origin, of a size of about one, with cameras' mean up along +z."""
     poses, points = camera_poses(problem.cameras), np.asarray(problem.points)
     places = np.concatenate([poses[:, :, 3], points])
     places = places[np.isfinite(places).all(axis=1)]

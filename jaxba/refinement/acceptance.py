@@ -30,8 +30,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
 
 NEGLIGIBLE = 1e-6
-"""Predicted decrease, relative to the cost, below which there are no camera rounds and no further trials. Source: Ceres
-function_tolerance."""
+"""Relative predicted decrease below which there are no camera rounds or further trials. Source: Ceres."""
 
 POINT_DECREASE = 1e-2
 """Candidates after the full step stop their point iterations once one lowers the cost by less than this fraction of the
@@ -43,8 +42,7 @@ NEAR_CONVERGENCE = 1e-3
 time. Measured: in earlier iterations it brings nothing more."""
 
 COST_ROUNDING = 8.0
-"""Rounding error of a cost in machine epsilons, relative to the cost: 1e-6 in float32, which was measured on real
-problems, and 2e-15 in float64."""
+"""Relative rounding error of a cost in machine epsilons: 1e-6 in float32, measured, and 2e-15 in float64."""
 
 
 class Step(NamedTuple):

@@ -42,9 +42,8 @@ GOOD_GAIN = 0.5
 """Gain ratio from which the linear model is trusted and there are no camera rounds."""
 
 MAX_COST_RATIO = 1.5
-"""Largest cost of a candidate, relative to the cost before the step, for camera rounds: beyond it, outlying points
-would pull the cameras away. On Ladybug-49 with a constant lambda of 1e-6, a limit of 10 led to a minimum 19% above that
-reached with 1.5."""
+"""Largest cost of a candidate, relative to the cost before the step, for camera rounds: outliers would pull cameras
+away. On Ladybug-49 with a constant lambda of 1e-6, a limit of 10 led to a minimum 19% above that reached with 1.5."""
 
 MIN_GAINS = (-5.0, -0.5)
 """Smallest gain ratio after one camera round, and after more, for which there is another one. On six real problems none
@@ -64,8 +63,7 @@ predicted such a step, it is a Gauss-Newton step, and nothing is gained beyond i
 
 
 class Search(NamedTuple):
-    """The candidates of a step: shorter ones until one is accepted, then pattern moves; after each of them its camera
-    rounds."""
+    """The candidates of a step: shorter ones until one is accepted, then pattern moves; after each, camera rounds."""
 
     best: Candidate  # the last rejected one or, once one was accepted, the one with the lowest cost
     cameras: Float[Array, "parameters cameras"]  # origin of the next candidate

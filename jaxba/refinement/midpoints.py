@@ -25,8 +25,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
 UNDISTORTIONS = 10
-"""Iterations that remove the distortion of a pixel: of a fixed point for BAL, of Newton's method for other models. They
-need not converge: point iterations follow."""
+"""Iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge."""
 
 FEW_UNDISTORTIONS = 3
 """The same within an iteration of the solver, where it is done for every candidate."""
@@ -73,12 +72,10 @@ def choose_starts(
 ) -> Float[Array, "2 3 points"]:
     """Two starts for every point: its position after the step and the midpoint of its rays.
 
-    First the one with the lower cost, or the only one that has not diverged; then the other one, or the same if there
-    is none.
+    First the one of lower cost, or that has not diverged; then the other one, or the same if there is none.
 
-    If the linear model sends a point behind its cameras, or so far away that its gradient vanishes, small steps of its
-    own do not bring it back; the midpoint of its rays does. A midpoint that has diverged itself (`PreviousPoints`) is
-    not used.
+    If the linear model sends a point behind its cameras, or so far away that its gradient vanishes, its own steps do
+    not bring it back; the midpoint of its rays does, unless it diverged itself (`PreviousPoints`).
     """
     middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
 

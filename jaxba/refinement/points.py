@@ -13,8 +13,7 @@ Two cases do not come back by themselves, since the cost does not see them:
   vanishes, or send it through infinity behind its cameras. So neither the step nor the point's own iterations may
   increase its distance more than `MAX_DISTANCE_RATIO` times.
 
-Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment" (embedded point iterations);
-Ceres calls the same idea inner iterations.
+Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment"; Ceres' inner iterations.
 """
 
 from __future__ import annotations
@@ -62,14 +61,9 @@ class PreviousPoints(NamedTuple):
 
     points: Float[Array, "3 points"]
 
-    front: Bool[Array, " slots"]
-    """Whether the point was in front of the camera."""
-
-    inverse_depth_sum: Float[Array, " points"]
-    """Sum over the cameras of a point, negative in front of them."""
-
-    costs: Float[Array, " points"]
-    """Cost of the observations of each point, pixels^2."""
+    front: Bool[Array, " slots"]  # whether the point was in front of the camera
+    inverse_depth_sum: Float[Array, " points"]  # sum over the cameras of a point, negative in front of them
+    costs: Float[Array, " points"]  # cost of the observations of each point, pixels^2
 
     @classmethod
     def of(cls, layout: Layout, points: Float[Array, "3 points"], reference: Reference) -> PreviousPoints:

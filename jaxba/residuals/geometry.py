@@ -56,6 +56,5 @@ def heading(pose, *, azimuth, north, up, sigma):
 
 @residual
 def position(pose, *, position, lever_arm, whitening):
-    """A GNSS antenna at `lever_arm` (3) in the camera's frame, measured at `position` (3) in the world: the difference
-    whitened by a matrix (3, 3) (three numbers)."""
+    """A GNSS antenna at `lever_arm` (3) in the camera's frame, at `position` (3) in the world, whitened (3, 3)."""
     return times(whitening, pose.center + times(pose.rotation.T, lever_arm) - position)

@@ -47,8 +47,7 @@ def imu(
 
     The block `motion` has nine numbers of each image: velocity of the IMU in the world, and the biases. `preintegrated`
     makes the data up to `whitening`, for image after image. `gravity` (3) is in the world, such as (0, 0, -9.81).
-    `mount` (3, 4) is `[R | t]` from the IMU's frame to the camera's, Kalibr's `T_cam_imu`. Scene units are those of
-    the accelerations, metres."""
+    `mount` (3, 4) is `[R | t]` from the IMU's frame to the camera's, Kalibr's `T_cam_imu`. Scene units are metres."""
     changed = by_bias @ (motion[3:] - bias)
     first, second = (one.rotation.T @ mount[:, :3] for one in (pose, pose_2))
     turn = (rotation @ _exponential(changed[:3])).T @ first.T @ second
@@ -106,8 +105,7 @@ def _exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def _integrated(samples: Float[Array, "n 6"], steps: Float[Array, " n"]) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Nine numbers with the derivatives of the rotation, by a small rotation after it, of velocity and of position;
-    and these (Forster et al. 2017, eq. 33)."""
+    """Nine numbers, with derivatives of rotation (by one after it), velocity and position (Forster et al., eq. 33)."""
 
     def advance(state: tuple[Array, Array, Array], of: tuple[Array, Array]) -> tuple[tuple[Array, Array, Array], None]:
         (rotation, velocity, position), (sample, dt) = state, of

@@ -213,22 +213,13 @@ class _System(NamedTuple):
     """The linear system in observations, sorted by point. Steps of points are `turn u`, with columns of the Jacobian by
     u that are nearly orthogonal and of unit length, or zero where a point is not determined."""
 
-    jacobian: Any
-    """Sparse, of two rows for each observation, by the unknowns of cameras."""
-
-    by_point: Any
-    """Sparse, of two rows for each observation by u."""
-
-    inverse: Float[np.ndarray, "points 3 3"]
-    """C^-1 of each point, in u."""
-
+    jacobian: Any  # sparse, of two rows for each observation, by the unknowns of cameras
+    by_point: Any  # sparse, of two rows for each observation by u
+    inverse: Float[np.ndarray, "points 3 3"]  # C^-1 of each point, in u
     turn: Float[np.ndarray, "points 3 3"]
-    lost: Bool[np.ndarray, "points 3"]
-    """Coordinates of points that their observations do not determine, whatever the cameras."""
-
+    lost: Bool[np.ndarray, "points 3"]  # coordinates that observations do not determine, whatever the cameras
     seen: Bool[np.ndarray, " points"]
-    starts: Int[np.ndarray, " points_and_one"]
-    """First observation of each point."""
+    starts: Int[np.ndarray, " points_and_one"]  # first observation of each point
 
 
 def _system(

@@ -50,12 +50,10 @@ EQUIVALENT_STEPS = (1 + len(START_DISTANCES)) * POINT_ITERATIONS // 3
 """Accept decisions with three point iterations each that take as long as a search, to choose the compilation level."""
 
 BREAK_EVEN = 3_000_000
-"""Observations times accept decisions after which a better program has paid for its compilation, as
-`benchmarks.compilation` measures it."""
+"""Observations times accept decisions after which a better program has paid (`benchmarks.compilation`)."""
 
 MIN_RELATIVE_GAIN = 1e-3
-"""Smallest decrease for which a point is moved, relative to its own cost: less means the same minimum. Chosen once, not
-fitted."""
+"""Smallest decrease, relative to its cost, for which a point is moved: less is the same minimum. Not fitted."""
 
 MIN_GAIN = 1e-6
 """Smallest decrease for which a point is moved, relative to the mean cost of a point after the search."""
@@ -91,8 +89,8 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Constant points stay. Images that face away from their points are left out, as by `solve`. Best at the end of a
     solve: at a bad start points would be fitted to wrong cameras.
 
-    `loss` is the robust loss of the squared whitened residual. Returns the problem with the moved points, in float64.
-    Raises ProblemError: the cost is not finite."""
+    `loss` is that of the squared whitened residual. Returns the problem with moved points, in float64. Raises
+    ProblemError: the cost is not finite."""
     check_problem(problem)
     return retriangulate_without(facing_away(problem), problem, loss)
 

@@ -32,8 +32,7 @@ from jaxba.runtime.jit import Options, jit, quick_options, right_options
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, and full after as many iterations as pay
-for it, by the number of observations."""
+"""`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, full once iterations pay for it."""
 
 Level = Literal["full", "quick"]
 """How much one program is optimised."""

@@ -35,15 +35,13 @@ HEARTBEAT_S = 30
 """Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
 
 WAIT_MS = 1 << 30
-"""Milliseconds, twelve days, that processes wait for what the first one does. Gloo's collectives wait for half an
-hour."""
+"""Milliseconds, twelve days, that processes wait for the first one. Gloo's collectives wait half an hour."""
 
 THREADS = 8
 """Of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill."""
 
 LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")
-"""What errors say that JAX raises where another process is gone: its collectives, and its service of processes. They
-have no class of their own."""
+"""What JAX's errors say where another process is gone. They have no class of their own."""
 
 _done = itertools.count()
 
@@ -128,8 +126,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
     """The first devices of every process, in the order of the processes.
 
     A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked for. `count` is
-    that of each process; None: one, or all that there are if there are several processes. Raises InputError: a process
-    has fewer."""
+    that of each process; None: one, or all with several processes. Raises InputError: a process has fewer."""
     if count is not None:
         count = int(count)
         if count < 1:
@@ -152,8 +149,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
 def _threads(count: int) -> Iterator[None]:
     """In which JAX starts with so many of XLA's threads for virtual devices, unless it has started or NPROC is set.
 
-    Devices share the threads, and batched factorisations of several at a time wait for each other for ever where there
-    are few.
+    Devices share them: with few, batched factorisations of several wait for each other for ever.
     """
     if count <= THREADS or "NPROC" in os.environ:
         yield

@@ -25,8 +25,7 @@ SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}
 """The signals, and what after one of them stops at once."""
 
 EXIT_DELAY_S = 1.0
-"""Seconds after a second signal until the process is ended, if Python has not handled it by then. Python handles no
-signals while a compiled program runs."""
+"""Seconds from a second signal to the process's end; Python handles none while a compiled program runs."""
 
 RAISE_AGAIN_S = 0.01
 """Seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended."""
@@ -40,9 +39,8 @@ class Interrupt:
     KeyboardInterrupt; otherwise each one raises it. A signal that is ignored, as Ctrl-C is under `nohup`, stays so.
     Nothing is changed in a thread other than the first, where signals are not handled.
 
-    With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a long compiled
-    program the first one prints a message, and the second ends the process. Ending it is safe, since commands write
-    files atomically.
+    With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a compiled
+    program the first one prints a message, and the second ends the process: files are atomic.
     """
 
     status = 0
@@ -50,8 +48,7 @@ class Interrupt:
 
     def __init__(self, unit: str = "", *, graceful: bool = False) -> None:
         """Does nothing yet. `unit` is what is finished after the first signal, for the message, e.g. `iteration`.
-        Without it, signals that have a handler already are left alone. `graceful` is the initial value of the
-        attribute, which can be changed later."""
+        Without it, signals that have a handler already are left alone. `graceful` can be changed later."""
         self.unit, self.graceful, self.requested = unit, graceful, False
         # signals that the thread and the handler have seen; Python calls the handler once for several signals
         self._received, self._handled = 0, 0

@@ -21,8 +21,7 @@ RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""XLA's options for programs that are hardly optimised, as far as a jaxlib knows them; from 0.12 on there are no older
-emitters."""
+"""XLA's options for hardly optimised programs, as far as a jaxlib knows them: 0.12 has no older emitters."""
 
 
 @functools.cache
@@ -55,8 +54,7 @@ def _are_known(options: Options) -> bool:
 class jit:
     """`jax.jit`, compiled with `right_options`.
 
-    JAX takes options for whole programs alone. So what is called inside another program, or inside a transformation,
-    has the options of that.
+    JAX takes options for whole programs: what is called inside another one, or a transformation, has its options.
     """
 
     def __init__(self, function: Callable[..., Any], *, once: bool = False, **settings: Any) -> None:

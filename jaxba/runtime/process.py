@@ -27,12 +27,10 @@ _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 """Parameter numbers of glibc's mallopt (malloc.h)."""
 
 MAPPINGS_SHARE = 0.4
-"""Share of the limit of memory mappings from which on programs are dropped. One problem under sixteen solvers took a
-tenth of the limit."""
+"""Share of the limit of memory mappings at which programs are dropped. Sixteen solvers took a tenth of it."""
 
 GROWTH_SHARE = 0.1
-"""Growth, as a share of the limit, since programs were dropped last, below which they are not dropped again: mappings
-that are not JAX's stay."""
+"""Growth, as such a share, below which they are not dropped again: mappings that are not JAX's stay."""
 
 _mappings_left = 0
 """Mappings that were left when programs were dropped last."""
@@ -52,8 +50,7 @@ def keep_memory() -> bool:
     That holds for glibc's main arena, the one of the process's first thread; the arena of another thread holds 64 MiB
     and is returned when it empties. So XLA is set to run programs in the thread that calls them, which must be done
     before any program runs. (A single arena for all threads would do as well, but threads that compile would wait for
-    each other: 7.8 s instead of 4.9 s for the step of `bold` on Ladybug-49.) Returns whether it took effect; false
-    where the C library is another one."""
+    each other: 7.8 s instead of 4.9 s for the step of `bold` on Ladybug-49.) Returns whether it took effect."""
     if not sys.platform.startswith("linux"):
         return False
     try:
@@ -146,8 +143,7 @@ def single_blas_thread() -> Iterator[None]:
 
 
 def _as_owner_of_blas(change: Callable[[], T]) -> T:
-    """Changes BLAS's threads. Recent versions of threadpoolctl let the first thread that does so own those of OpenBLAS,
-    and ignore all others."""
+    """Changes BLAS's threads. In recent threadpoolctl the first thread that does so owns OpenBLAS's."""
     disown = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", lambda **_: None)
     disown(force=True)
     changed = change()

@@ -140,8 +140,7 @@ def check(config: SceneConfig) -> None:
 
 
 OUTLIER_SHARE, OUTLIER_SIZE = 0.002, 10.0
-"""A few outliers give the slow convergence of BAL: Ceres' rule needs 16 iterations on `ladybug-49` with them, 11
-without."""
+"""Outliers give BAL's slow convergence: Ceres' rule needs 16 iterations on `ladybug-49` with them, 11 without."""
 
 STREET_DRIFT = 0.3
 """Times `cameras^-1.5`, the start's drift per camera on a street: its end is then off by 0.2 steps at any length."""

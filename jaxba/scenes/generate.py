@@ -26,11 +26,10 @@ def random_scene_with_truth(
     """A random scene at perturbed initial values, and the same one at the ground truth.
 
     Both have the same noisy observations, sorted by point and camera as in BAL files, so the cost of the truth is near
-    `noise^2 * observations` where there are no outliers. The numbers of cameras, points and observations are exactly
-    those of the configuration. Every point is seen by two cameras or more and lies in front of and inside the image of
-    each; every camera sees four points or more where the geometry allows it. `seed` is a seed or a generator; the same
-    seed gives the same numbers. Returns (start, truth). Raises ProblemError: the options contradict each other, or the
-    cameras overlap too little for them."""
+    `noise^2 * observations` where there are no outliers. Counts are exactly those of the configuration. Every point is
+    seen by two cameras or more and lies in front of and inside the image of each; every camera sees four points or more
+    where the geometry allows it. `seed` is a seed or a generator; the same seed gives the same numbers. Returns (start,
+    truth). Raises ProblemError: the options contradict each other, or the cameras overlap too little for them."""
     check(config)
     rng = np.random.default_rng(seed)
     path, truth = _path_and_truth(config, rng)

@@ -38,26 +38,13 @@ Depth = float | np.ndarray
 class Path:
     """Cameras in the order of the path, and the depths at which each one sees new points."""
 
-    rotations: Float[np.ndarray, "cameras 3 3"]
-    """World to camera; a camera looks down its -z, x to the right, y up."""
-
-    centers: Float[np.ndarray, "cameras 3"]
-    """Scene units."""
-
-    near: Float[np.ndarray, " cameras"]
-    """Nearest new points, in scene units."""
-
-    far: Float[np.ndarray, " cameras"]
-    """Farthest new points, in scene units."""
-
-    focus: Float[np.ndarray, " cameras"]
-    """Depth of the points that most other cameras see too, in scene units."""
-
-    lap: int
-    """Cameras after which the path returns to the same position; 0 where it never does."""
-
-    index: Int[np.ndarray, " cameras"]
-    """Camera index in the problem of each camera along the path."""
+    rotations: Float[np.ndarray, "cameras 3 3"]  # world to camera; a camera looks down its -z, x to the right, y up
+    centers: Float[np.ndarray, "cameras 3"]  # scene units
+    near: Float[np.ndarray, " cameras"]  # nearest new points, in scene units
+    far: Float[np.ndarray, " cameras"]  # farthest new points, in scene units
+    focus: Float[np.ndarray, " cameras"]  # depth of the points that most other cameras see too, scene units
+    lap: int  # cameras after which the path returns to the same position; 0 where it never does
+    index: Int[np.ndarray, " cameras"]  # index in the problem of each camera along the path
 
 
 def make_path(config: SceneConfig, rng: np.random.Generator) -> Path:

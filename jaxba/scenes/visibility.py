@@ -18,8 +18,7 @@ ATTEMPTS = 24
 """Attempts to place a point where enough cameras see it; each is nearer to the focus of the view than the last."""
 
 WINDOW = 2.5
-"""Candidate cameras per wanted view. At an end of the path half of the candidates do not exist, which takes 2; the rest
-is for missed views."""
+"""Candidate cameras per wanted view: 2, as half do not exist at an end of the path, and more for missed views."""
 
 NEAREST, FARTHEST = 0.5, 2.0
 """A view nearer than this part of min_depth, or farther than this many times max_depth, does not count."""

@@ -72,9 +72,8 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
 
 
 def parse(text: str, name: str, *, as_text: bool = False) -> Any:
-    """Plain data from YAML; `name` says whose text it is, for messages. With `as_text` all scalars stay the text that
-    they are, as names must: `000010`, `1_000`, `yes`, `null`. Raises SettingsError: not YAML, or a mapping has a key
-    twice."""
+    """Plain data from YAML; `name` is for messages. With `as_text` all scalars stay the text that they are, as names
+    must: `000010`, `1_000`, `yes`, `null`. Raises SettingsError: not YAML, or a mapping has a key twice."""
     import yaml
 
     where = lambda mark: f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""

@@ -51,8 +51,7 @@ def make_env(
     """The game of a preset: an environment of many scenes that step together.
 
     It has `reset(key)` and `step(state, actions)`, pure functions that may be jitted, and `num_envs`,
-    `observation_size` and `action_size`; see `game/protocol.py`. They run in 64 bits, with `jax.enable_x64(True)` or
-    inside a program that has it on.
+    `observation_size` and `action_size`; see `game/protocol.py`. They run in 64 bits (`jax.enable_x64(True)`).
 
     Args:
         preset: name of a preset of `jaxba-train`, or the path of a YAML file.

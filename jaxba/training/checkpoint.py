@@ -1,7 +1,6 @@
 """Checkpoints: a tree of arrays and JSON metadata in one `.npz` file, written atomically.
 
-A tree is stored as a flat mapping from paths to NumPy arrays; every leaf that is restored must have the expected shape
-and type.
+A tree is a flat mapping from paths to NumPy arrays; restored leaves must have the expected shape and type.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ _METADATA = "metadata"
 
 
 class TrainError(InputError):
-    """A run that cannot start or continue, or a checkpoint that cannot be used. The message is one line for a
-    person."""
+    """A run that cannot start or continue, or an unusable checkpoint. The message is one line for a person."""
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
@@ -73,8 +71,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, in their order in the file. Raises TrainError: the file is damaged. Raises OSError:
-    it cannot be opened."""
+    """All arrays of an `.npz` file, in its order. Raises TrainError: it is damaged. Raises OSError: not opened."""
     with path.open("rb") as stream:
         try:
             with np.load(stream) as file:
@@ -97,9 +94,8 @@ def steps(folder: Path) -> list[int]:
 
 def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
     """Writes a checkpoint, over an old one of the same number, then removes all but the last `keep` up to it, this one
-    included, and incomplete ones of a killed process. The folder is created if it is missing; metadata are anything
-    that JSON can hold. Raises TrainError: it cannot be written; those before are still there. Raises OSError: the
-    folder cannot be created."""
+    included, and incomplete ones of a killed process. The folder is created if missing; metadata are JSON. Raises
+    TrainError: it cannot be written; those before are still there. Raises OSError: the folder cannot be created."""
     folder.mkdir(parents=True, exist_ok=True)
     path = _path(folder, step)
     if path.is_dir():  # no checkpoint, and in the way of one

@@ -45,8 +45,7 @@ class TrainConfig:
     """Of all random numbers: the scenes, and with the number of an agent its training."""
 
     seeds: int = 1
-    """Agents trained side by side on the same scenes, in one program over an axis of agents. Their replay buffers are
-    held at once."""
+    """Agents trained side by side on the same scenes, in one program. Their replay buffers are held at once."""
 
     chunks: int = 40
     """Length of each agent's training in calls of the compiled loop, each of `loop.steps_per_chunk` vector steps."""

@@ -69,20 +69,11 @@ def best_of(policies: Sequence[Best]) -> Best:
 class Hooks:
     """Callbacks of a run."""
 
-    stage: Callable[[str], None] = lambda _: None
-    """Called with a line of text when something begins that takes a while."""
-
-    rows: Callable[[list[Row]], None] = lambda _: None
-    """Called after each chunk with its rows of the log, one of every agent."""
-
-    best: Callable[[tuple[Best, ...]], None] = lambda _: None
-    """Called with the best policies of all agents whenever one of them is new."""
-
-    stop: Callable[[], bool] = lambda: False
-    """Called after each chunk; if it returns true, the run is saved and ends."""
-
-    note: Callable[[str], None] = lambda _: None
-    """Called with a line of text on damaged files."""
+    stage: Callable[[str], None] = lambda _: None  # gets a line of text when something long begins
+    rows: Callable[[list[Row]], None] = lambda _: None  # gets the rows of a chunk, one of every agent
+    best: Callable[[tuple[Best, ...]], None] = lambda _: None  # gets the best policies of all agents when one is new
+    stop: Callable[[], bool] = lambda: False  # asked after each chunk: if true, the run is saved and ends
+    note: Callable[[str], None] = lambda _: None  # gets a line of text on damaged files
 
 
 def prepare_folder(
@@ -138,7 +129,6 @@ def _keys(config: TrainConfig) -> Any:
 
 
 def _shapes(config: TrainConfig, env: Any) -> Any:
-    """Those of the loop's state."""
     return jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, _keys(config)))
 
 
@@ -209,7 +199,6 @@ class _Run:
             self.best = tuple(Best(_agent(actors, k), agent=k, **one) for k, one in enumerate(best))
 
     def _read_latest(self, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
-        """Metadata and arrays."""
         reasons = []
         for step in reversed(checkpoint.steps(self.folder)):
             try:

@@ -24,8 +24,7 @@ Row = dict[str, Any]
 class Log:
     """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones.
 
-    Files for TensorBoard are written by the thread that calls: that of tensorboardX's `SummaryWriter` ends when the
-    disk is full, and is then waited for for ever.
+    The calling thread writes TensorBoard's files: that of tensorboardX ends on a full disk, waited for for ever.
     """
 
     def __init__(self, folder: Path, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:

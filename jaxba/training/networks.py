@@ -31,23 +31,16 @@ def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
 
 
 class MLP(nn.Module):
-    """Hidden layers of one width with ReLU, and a linear last layer with small initial weights."""
+    """Hidden layers of one width with ReLU, and a linear last layer with small initial weights.
 
-    width: int
-    """Units of a hidden layer."""
-
-    layers: int
-    """Hidden layers."""
-
-    outputs: int
-    """Units of the last layer."""
-
-    layer_norm: bool = False
-    """Whether each hidden layer is normalised before its ReLU. Source: Ba et al. 2016; in critics Ball et al. 2023.
-
-    Without learned scale and shift, which the layers around it can provide: an update of width 64 takes a tenth less
-    time.
+    With `layer_norm` each hidden layer is normalised before its ReLU, without learned scale and shift, which the next
+    layers have: an update of width 64 takes a tenth less time. Source: Ba et al. 2016; in critics Ball et al. 2023.
     """
+
+    width: int  # units of a hidden layer
+    layers: int  # hidden layers
+    outputs: int  # units of the last layer
+    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
@@ -63,14 +56,9 @@ class MLP(nn.Module):
 class Value(nn.Module):
     """Value of an observation."""
 
-    width: int
-    """Units of a hidden layer."""
-
-    layers: int
-    """Hidden layers."""
-
-    layer_norm: bool = False
-    """See `MLP`."""
+    width: int  # units of a hidden layer
+    layers: int  # hidden layers
+    layer_norm: bool = False  # see `MLP`
 
     @nn.compact
     def __call__(self, observation: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
@@ -81,17 +69,10 @@ class Value(nn.Module):
 class Critic(nn.Module):
     """An ensemble of values of an observation and an action. Their parameters are stacked along the first axis."""
 
-    width: int
-    """Units of a hidden layer."""
-
-    layers: int
-    """Hidden layers."""
-
-    layer_norm: bool = False
-    """See `MLP`."""
-
-    members: int = 2
-    """Networks in the ensemble."""
+    width: int  # units of a hidden layer
+    layers: int  # hidden layers
+    layer_norm: bool = False  # see `MLP`
+    members: int = 2  # networks in the ensemble
 
     @nn.compact
     def __call__(
@@ -117,17 +98,10 @@ class Actor(nn.Module):
     network's output is zero, so that an untrained policy is spread over all of (-1, 1).
     """
 
-    width: int
-    """Units of a hidden layer."""
-
-    layers: int
-    """Hidden layers."""
-
-    actions: int
-    """Numbers of an action."""
-
-    log_std_min: float
-    """Lower bound, negative."""
+    width: int  # units of a hidden layer
+    layers: int  # hidden layers
+    actions: int  # numbers of an action
+    log_std_min: float  # lower bound, negative
 
     @nn.compact
     def __call__(

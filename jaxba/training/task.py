@@ -71,17 +71,10 @@ scene (`paired_ratio`), geometric mean over agents; and the same for every agent
 class Task:
     """Everything that `driver.train` needs, and the baselines."""
 
-    config: TrainConfig
-    """Of the run."""
-
-    game: Game
-    """To train on."""
-
-    held_out: tuple[Bank, ...]
-    """Scenes that training never sees, a bank per class."""
-
-    baseline_runs: dict[str, Runs]
-    """What the baselines did on the held-out scenes."""
+    config: TrainConfig  # of the run
+    game: Game  # to train on
+    held_out: tuple[Bank, ...]  # scenes that training never sees, a bank per class
+    baseline_runs: dict[str, Runs]  # what the baselines did on the held-out scenes
 
     @cached_property
     def rules(self) -> dict[str, Score]:
@@ -150,10 +143,9 @@ def build(
     on_game: Callable[[Game], Any] = lambda _: None,
 ) -> Task:
     """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. `report` is called with a
-    line of text when something begins that takes a while; `baselines` are names to compare with, unless the folder has
-    their results already; `BASELINES` if None; `on_game` is called with the game before they are played. Raises
-    ValueError: too few scenes are usable, or another version wrote the files; one line for a person. Raises OSError:
-    the folder cannot be written or read."""
+    line when something long begins; `baselines` are names to compare with, unless the folder has results; `BASELINES`
+    if None; `on_game` is called with the game first. Raises ValueError: too few scenes are usable, or another version
+    wrote the files; one line for a person. Raises OSError: the folder cannot be written or read."""
     splits = _splits(config, folder, report)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
@@ -193,7 +185,8 @@ def _baseline_runs(
         found = best_constant_action(config.bank.classes, banks, config.game, game.options, policies)
         policies[CONSTANT] = found, game.options
     runs = play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
-    _write_runs(path, runs)
+    banks = ((f"{name}/{k}", run) for name, played in runs.items() for k, run in enumerate(played))  # as in the table
+    checkpoint.write_arrays(path, {f"{at}/{field}": x for at, run in banks for field, x in run._asdict().items()})
     return runs
 
 
@@ -222,11 +215,6 @@ def baseline_policies(
         elif has_embedded:
             found[name] = make_policy(rule), options
     return found
-
-
-def _write_runs(path: Path, runs: dict[str, Runs]) -> None:
-    banks = ((f"{name}/{k}", run) for name, played in runs.items() for k, run in enumerate(played))  # as in the table
-    checkpoint.write_arrays(path, {f"{at}/{field}": x for at, run in banks for field, x in run._asdict().items()})
 
 
 def _write_banks(path: Path, splits: list[Split]) -> None:

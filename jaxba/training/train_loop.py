@@ -1,7 +1,6 @@
 """Training as one compiled program: act, step, store, sample and update in one scan.
 
-No data leaves the device within a chunk. A chunk compiles once per configuration and environment; the driver evaluates,
-saves checkpoints and logs between chunks.
+No data leaves the device within a chunk, which compiles once; the driver evaluates and saves between chunks.
 
 """
 
@@ -175,8 +174,7 @@ def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
 
 @functools.partial(jit, once=True, static_argnames=("sac", "loop"))
 def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
-    """`start` for several agents, one for each key, which share the environment's scenes; the state has a first axis of
-    agents."""
+    """`start` for an agent a key; they share the environment's scenes, and are the state's first axis."""
     return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
 
 

@@ -15,8 +15,7 @@ MOST_ENTROPY = math.log(2)
 """Nats of a uniform action in (-1, 1)."""
 
 RANDOM = 0.1
-"""Nats; a policy whose entropy is less than this below `MOST_ENTROPY` acts at random: as if over nine tenths of the
-range."""
+"""Nats; a policy of entropy less than this below `MOST_ENTROPY` acts at random: over nine tenths of the range."""
 
 SAME = 0.1
 """Decades of lambda; a policy with a smaller spread over states does the same in every state."""

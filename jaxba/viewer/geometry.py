@@ -23,17 +23,10 @@ WIDEST = 2.0
 class Frusta(NamedTuple):
     """The images of a problem in the plane at distance 1 before each camera."""
 
-    focal: Float[np.ndarray, "cameras 2"]
-    """Focal lengths, pixels."""
-
-    center: Float[np.ndarray, "cameras 2"]
-    """Principal points, pixels of the problem."""
-
-    flipped: Bool[np.ndarray, " cameras"]
-    """Whether y of the problem's pixels is upwards, as BAL's is."""
-
-    half: Float[np.ndarray, "cameras 2"]
-    """Half of width and height in the plane."""
+    focal: Float[np.ndarray, "cameras 2"]  # focal lengths, pixels
+    center: Float[np.ndarray, "cameras 2"]  # principal points, pixels of the problem
+    flipped: Bool[np.ndarray, " cameras"]  # whether y of the problem's pixels is upwards, as BAL's is
+    half: Float[np.ndarray, "cameras 2"]  # half of width and height in the plane
 
     def on_plane(self, pixels: Float[np.ndarray, "n 2"], cameras: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
         """Places of pixels in the planes of their cameras, without regard to distortion, as an image is shown."""

@@ -17,20 +17,11 @@ VIRIDIS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231,
 class Measures(NamedTuple):
     """How well a problem fits. What is not observed, or not projected to a finite pixel, is NaN."""
 
-    residuals: Float[np.ndarray, "observations 2"]
-    """Measured minus predicted, pixels of the problem."""
-
-    of_point: Float[np.ndarray, " points"]
-    """Root mean square length of the residuals of each point, pixels."""
-
-    of_image: Float[np.ndarray, " cameras"]
-    """The same of each image."""
-
-    tracks: Int[np.ndarray, " points"]
-    """Number of observations of each point."""
-
-    seen: Int[np.ndarray, " cameras"]
-    """The same of each image."""
+    residuals: Float[np.ndarray, "observations 2"]  # measured minus predicted, pixels of the problem
+    of_point: Float[np.ndarray, " points"]  # root mean square length of its residuals, pixels
+    of_image: Float[np.ndarray, " cameras"]  # the same of each image
+    tracks: Int[np.ndarray, " points"]  # number of observations of each point
+    seen: Int[np.ndarray, " cameras"]  # the same of each image
 
     @property
     def rmse(self) -> float:

@@ -85,7 +85,6 @@ class Viewer:
         view.position, view.look_at, view.up_direction, view.fov, view.near = place, target, up, float(fov), near
 
     def _clicked(self, place: int, camera: int, event: viser.SceneNodePointerEvent) -> None:
-        """A click on an image."""
         if not self._is_inside(event.client):  # there a click is on a point
             self._hit = event.screen_pos
             self.choose(self.stages[place], camera, event.client)

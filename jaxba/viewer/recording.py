@@ -33,35 +33,16 @@ ENDING = ".npz"
 class Recording:
     """A solve, iteration by iteration. Entry 0 of the per-iteration arrays is the start."""
 
-    problem: BundleProblem
-    """The start, thinned."""
-
-    whole: int
-    """Number of points of the problem, recorded or not."""
-
-    cameras: Float[np.ndarray, "states cameras parameters"]
-    """Cameras at the start and after each accepted step."""
-
-    points: Float[np.ndarray, "states points 3"]
-    """The same of points."""
-
-    state: Int[np.ndarray, " iterations"]
-    """Position in `cameras` and `points` after each iteration."""
-
-    cost: Float[np.ndarray, " iterations"]
-    """Accepted cost after each iteration, pixels^2."""
-
-    damping: Float[np.ndarray, " iterations"]
-    """Lambda; NaN for the start."""
-
-    gain_ratio: Float[np.ndarray, " iterations"]
-    """Actual over predicted decrease; NaN for the start."""
-
-    time_s: Float[np.ndarray, " iterations"]
-    """Seconds since the start."""
-
-    source: str = ""
-    """Where the problem was read."""
+    problem: BundleProblem  # the start, thinned
+    whole: int  # number of points of the problem, recorded or not
+    cameras: Float[np.ndarray, "states cameras parameters"]  # cameras at the start and after each accepted step
+    points: Float[np.ndarray, "states points 3"]  # the same of points
+    state: Int[np.ndarray, " iterations"]  # position in `cameras` and `points` after each iteration
+    cost: Float[np.ndarray, " iterations"]  # accepted cost after each iteration, pixels^2
+    damping: Float[np.ndarray, " iterations"]  # lambda; NaN for the start
+    gain_ratio: Float[np.ndarray, " iterations"]  # actual over predicted decrease; NaN for the start
+    time_s: Float[np.ndarray, " iterations"]  # seconds since the start
+    source: str = ""  # where the problem was read
 
     @property
     def last(self) -> int:
@@ -132,8 +113,7 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 
 
 def write_recording(recording: Recording, path: StrPath) -> None:
-    """Writes a recording, whole or not at all. Points are float32, relative to their middle. Raises ProblemError: it
-    cannot be written."""
+    """Writes a recording, whole or not at all; points are float32 from their middle. Raises ProblemError."""
     problem, lenses = recording.problem, recording.problem.lenses
     middle = np.median(recording.points[-1], axis=0)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}

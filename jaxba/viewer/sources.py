@@ -28,14 +28,9 @@ class Shown:
 
     name: str
     recording: Recording
-    looks: Looks | None = None
-    """Colours of points, sizes of images and their principal points; None if they are not known."""
-
-    names: tuple[str, ...] | None = None
-    """Names of images."""
-
-    images: Path | None = None
-    """Folder of the images."""
+    looks: Looks | None = None  # colours, sizes and principal points, if known
+    names: tuple[str, ...] | None = None  # names of images
+    images: Path | None = None  # folder of the images
 
     @property
     def problem(self) -> BundleProblem:

@@ -44,8 +44,7 @@ class Stage:
     def __init__(
         self, server: viser.ViserServer, shown: Shown, place: int, points: int, clicked: Clicked, captioned: bool
     ) -> None:
-        """Draws the last iteration, with at most so many points. `place` is the number among those side by side. A
-        caption above the scene is its name."""
+        """Draws the last iteration, with at most so many points. `place` counts those side by side."""
         self.shown, self._server, self._clicked = shown, server, clicked
         self.iteration, self.point_size, self.enlarged = shown.recording.last, POINT_SIZE, 1.0
         self.chosen: int | None = None
@@ -117,12 +116,10 @@ class Stage:
         return self.points[keep[self.points]]
 
     def _seen(self) -> np.ndarray:
-        """Points that the chosen image sees."""
         return np.asarray(self.problem.point_index)[np.asarray(self.problem.camera_index) == self.chosen]
 
     def view_of(self, camera: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """The camera-to-world pose of an image in the stage, half of its width and height at distance 1, and how far
-        before the camera it is drawn."""
+        """An image's camera-to-world pose in the stage, half its size at distance 1, and how far off it is drawn."""
         half = self.image_planes.half[camera]
         pose = self._similarity.poses(camera_poses(self.problem.cameras)[[camera]])[0]
         return pose, half, geometry.depth_of_image(half, self.enlarged * self._size)
@@ -180,7 +177,6 @@ class Stage:
         return colours(self._values()[name], *self.limits[name])
 
     def _values(self) -> dict[str, np.ndarray]:
-        """What colours show."""
         found = self.measures
         return {ERROR: found.of_point, TRACK: found.tracks.astype(float), IMAGE: found.of_image}
 

@@ -2,8 +2,7 @@
 
 Cameras and points in `problems.csv` are those of the file names of https://grail.cs.washington.edu/projects/bal/ ; the
 download scripts of RootBA and of SymForce list the same 98. The SHA-256 of the compressed files of Ladybug-49 and
-Trafalgar-21 were computed on the files; the others are those that the Julia package VGDatasets states (it has the same
-two). 16 files have no published checksum.
+Trafalgar-21 were computed on the files; the others are those of the Julia package VGDatasets. 16 files have none.
 """
 
 from __future__ import annotations
@@ -26,14 +25,11 @@ FOLDER_VARIABLE = "JAXBA_BAL"
 class Entry(NamedTuple):
     """One file of the data set."""
 
-    family: str
-    """ladybug, trafalgar, dubrovnik, venice or final; the folder of the file."""
-
+    family: str  # ladybug, trafalgar, dubrovnik, venice or final; the folder of the file
     cameras: int
     points: int
 
-    sha256: str | None
-    """Checksum of the compressed file in hexadecimal digits; None where none is published."""
+    sha256: str | None  # of the compressed file, hexadecimal; None where none is published
 
     @property
     def name(self) -> str:
@@ -95,8 +91,7 @@ def downloaded_path(entry: Entry) -> Path | None:
 
 
 def local_path(name: str) -> Path:
-    """Path of the downloaded problem of a name. Raises ProblemError: there is no problem of that name, or it has not
-    been downloaded; one line that says how to."""
+    """Path of a downloaded problem. Raises ProblemError: no such problem, or not downloaded; says how to."""
     found = next((entry for entry in ENTRIES if entry.name == name.lower()), None)
     if found is None:
         raise ProblemError(_unknown(name))

@@ -18,8 +18,7 @@ from jaxba.io.colmap.model import MODELS, SENSORS, Camera, Frame, Image, Rig, Se
 from jaxba.problem.camera_models import CAMERA_MODELS
 
 Kinds = tuple[Mapping[str, int], str, str]
-"""Numbers in a binary file by their words in text, and what a message says of another word, and (after the name of the
-record) of another number."""
+"""Numbers in a binary file by their words in text, and what messages say of another word and another number."""
 
 
 class Fields:

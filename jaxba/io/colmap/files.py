@@ -58,8 +58,7 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
 
 def write_model(model: Model, folder: StrPath, suffix: str) -> None:
     """Writes the files of a model with rigs and frames, `.bin` or `.txt` by the suffix: all to a hidden folder, then
-    each replaces the old one. The folder is made if it does not exist. Raises ProblemError: the folder cannot be
-    written."""
+    each replaces the old one. It may not exist yet. Raises ProblemError: the folder cannot be written."""
     target = Path(folder)
     beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
     try:

@@ -1,8 +1,7 @@
 """Lenses of COLMAP as those of a problem.
 
 A model whose lenses are all of `AS_BAL` becomes a BAL problem, with pixels relative to the principal point: the
-derivatives of BAL's camera are formulas, and its blocks are small. Any other keeps its pixels, and its lenses their own
-camera models and numbers.
+derivatives of BAL's camera are formulas, and its blocks are small. Any other keeps pixels, camera models and numbers.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ def lenses_of(
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
-    """A camera with new numbers, which are BAL's if `bal`, where its model has them; all else stays as it is, bit by
-    bit."""
+    """A camera with new numbers, which are BAL's if `bal`, where its model has them; the rest stays, bit by bit."""
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
     names = CAMERA_MODELS[camera.model].parameters

@@ -98,8 +98,7 @@ class Image:
     pose: Pose
     camera: int
     name: bytes
-    keys: Shaped[np.ndarray, " keys"]
-    """Of type `KEY`."""
+    keys: Shaped[np.ndarray, " keys"]  # of type `KEY`
 
     def __str__(self) -> str:
         name = display_name(self.name.decode("utf-8", "backslashreplace"))
@@ -112,8 +111,7 @@ class Sensor:
 
     type: int
     id: int
-    from_rig: Pose | None
-    """None for the reference sensor, or where it is not known."""
+    from_rig: Pose | None  # None for the reference sensor, or where it is not known
 
 
 @dataclass(frozen=True)
@@ -131,8 +129,7 @@ class Frame:
     id: int
     rig: int
     pose: Pose
-    data: tuple[tuple[int, int, int], ...]
-    """Type and id of the sensor, and id of what it took (of a camera: of the image)."""
+    data: tuple[tuple[int, int, int], ...]  # type and id of the sensor, and of what it took (a camera: the image)
 
     @property
     def images(self) -> list[tuple[int, int]]:
@@ -145,20 +142,12 @@ class Model:
     """A COLMAP model. Records are in the order of the files."""
 
     folder: str
-    suffix: str
-    """`.bin` or `.txt`."""
-
+    suffix: str  # `.bin` or `.txt`
     cameras: dict[int, Camera]
     images: dict[int, Image]
-    points: Shaped[np.ndarray, " points"]
-    """Of type `POINT`."""
-
-    tracks: Shaped[np.ndarray, " elements"]
-    """Of type `TRACK`: those of the first point, then those of the second, and so on."""
-
-    rigs: dict[int, Rig] | None
-    """None in models of COLMAP before 3.12, whose images are all registered."""
-
+    points: Shaped[np.ndarray, " points"]  # of type `POINT`
+    tracks: Shaped[np.ndarray, " elements"]  # of type `TRACK`, point after point
+    rigs: dict[int, Rig] | None  # None before COLMAP 3.12, where all images are registered
     frames: dict[int, Frame] | None
 
     @property
@@ -183,9 +172,8 @@ def file_name(folder: str, file: str) -> str:
 
 
 def check_model(model: Model) -> None:
-    """Refuses a model whose structure is damaged. Raises ProblemError: an id stands for none or is there twice, an
-    image names no camera or a frame no rig, a pose is not finite or has no rotation; one line that names the file
-    and the record."""
+    """Refuses a damaged structure. Raises ProblemError: an id stands for none or is there twice, an image names no
+    camera or a frame no rig, a pose is not finite or has no rotation; one line that names the file and the record."""
     rigs, frames = model.rigs or {}, model.frames or {}
     for part, records in model.records.items():
         if NO_ID in records:

@@ -1,8 +1,7 @@
 """Which key-point of which image is of which point.
 
 A model says so twice: a key-point names its point, and a point's track its key-points. Key-points are believed, as in
-COLMAP's bundle adjustment: each stands beside its pixel, while numbers in tracks go wrong when key-points are sorted or
-dropped.
+COLMAP's bundle adjustment: each stands beside its pixel, numbers in tracks go wrong when key-points are sorted.
 """
 
 from __future__ import annotations
@@ -24,15 +23,10 @@ class Ordered(NamedTuple):
 
     model: Model
     images: list[Image]
-    keys: Shaped[np.ndarray, " keys"]
-    """Key-points of these images, one image after the other."""
-
-    first_key: Int[np.ndarray, " images+1"]
-    """Position of the first key-point of each image, and their number."""
-
+    keys: Shaped[np.ndarray, " keys"]  # key-points of these images, one image after the other
+    first_key: Int[np.ndarray, " images+1"]  # position of the first key-point of each image, and their number
     points: Shaped[np.ndarray, " points"]
-    order: Int[np.ndarray, " points"]
-    """Positions of the points in their file."""
+    order: Int[np.ndarray, " points"]  # positions of the points in their file
 
     def key_name(self, key: int) -> str:
         """A key-point for messages, by its position."""

@@ -31,27 +31,17 @@ class Assembled(NamedTuple):
     """A problem, and the records of the model that its parts are of."""
 
     problem: BundleProblem
-    images: list[Image]
-    """Those of the problem's cameras."""
-
-    points: Int[np.ndarray, " points"]
-    """Positions in `model.points`."""
-
-    notes: list[str]
-    """What was left out or mended, one line each."""
+    images: list[Image]  # those of the problem's cameras
+    points: Int[np.ndarray, " points"]  # positions in `model.points`
+    notes: list[str]  # what was left out or mended, one line each
 
 
 class Looks(NamedTuple):
     """What a model holds for looking at, in the order of the problem."""
 
-    colours: UInt8[np.ndarray, "points 3"] | None
-    """Red, green and blue of points; None if they are not known."""
-
-    sizes: Float[np.ndarray, "cameras 2"]
-    """Width and height of images, pixels; 0 where they are not known."""
-
-    principal: Float[np.ndarray, "cameras 2"]
-    """Principal points, pixels from the upper left corner."""
+    colours: UInt8[np.ndarray, "points 3"] | None  # red, green and blue of points, if known
+    sizes: Float[np.ndarray, "cameras 2"]  # width and height of images, pixels; 0 where they are not known
+    principal: Float[np.ndarray, "cameras 2"]  # principal points, pixels from the upper left corner
 
 
 def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point: bool = False) -> BundleProblem:
@@ -141,8 +131,7 @@ def _posed(model: Model, image: Image) -> Image:
 
 
 def _registered(model: Model) -> tuple[list[Image], list[str]]:
-    """Registered images by id, with the poses of their frames, and notes on the others. Raises ProblemError: it is not
-    known where a camera is in its rig."""
+    """Registered images by id, in poses of their frames; notes on others. Raises ProblemError as `place_in_rig`."""
     images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:
         return images, []

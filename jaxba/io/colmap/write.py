@@ -30,8 +30,7 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     """Writes a problem as a COLMAP model.
 
     All files are first written to a hidden folder; then each replaces the old one whole. They are binary, or text where
-    the other model is text and the folder holds no binary one. The folder is made if it does not exist, and may be that
-    of the other model.
+    the other model is and the folder has no binary one. It may be the other's.
 
     With another model, `like`, the problem is as `read_colmap` made it from that one, with optimised cameras and
     points. Poses, points and intrinsics of what is in the problem are replaced, and point errors; all else is written
@@ -39,12 +38,10 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
 
     Without another model, image, camera and point ids count from 1, and images are called `image0001.jpg` and so on.
     Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and constant.
-    Its image size is made up: its principal point is the centre of the smallest even size that holds all its pixels,
-    which are relative to the upper left corner. Other lenses keep their pixels, models and numbers. Weights, and what
-    is constant, cannot be stored.
+    Its image size is made up: the smallest even one that holds all its pixels around the centre, its principal point.
+    Other lenses keep their pixels, models and numbers. Weights, and what is constant, cannot be stored.
 
-    Raises ProblemError: the problem is not one of that model or cannot be stored, images of one camera have different
-    intrinsics, or the folder cannot be written."""
+    Raises ProblemError: another model's problem, unstorable, different intrinsics of a camera, unwritable folder."""
     if like is None:
         write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return

@@ -41,27 +41,13 @@ Landmark = tuple[list[float], list[int], list[list[float]]]
 class ForeignLens:
     """Intrinsics of one or more images."""
 
-    label: str
-    """How messages call it, such as `intrinsic 3`."""
-
-    focal: tuple[float, float]
-    """Focal lengths along x and y, pixels. Their ratio stays as it is where the distortion is BAL's."""
-
-    center: tuple[float, float] = (0.0, 0.0)
-    """Principal point in the coordinates of the observations; it stays as it is."""
-
-    distortion: Mapping[str, float] = field(default_factory=dict)
-    """Coefficients by their names in the camera models; those that are missing are zero."""
-
-    fisheye: bool = False
-    """Whether radii are angles."""
-
-    free: bool = True
-    """Whether f, k1 and k2 may be optimised, the last two where they are among the coefficients, if the distortion is
-    BAL's; other lenses stay as they are."""
-
-    size: tuple[float, float] | None = None
-    """Width and height of the image, pixels, if the principal point is measured from its corner."""
+    label: str  # how messages call it, such as `intrinsic 3`
+    focal: tuple[float, float]  # along x and y, pixels; their ratio stays where the distortion is BAL's
+    center: tuple[float, float] = (0.0, 0.0)  # principal point in the coordinates of the observations; stays
+    distortion: Mapping[str, float] = field(default_factory=dict)  # by names of the camera models; others are zero
+    fisheye: bool = False  # whether radii are angles
+    free: bool = True  # whether f, k1 and k2, where they are coefficients of BAL's distortion, may be optimised
+    size: tuple[float, float] | None = None  # of the image, pixels, if the principal point is from its corner
 
     @property
     def is_bal(self) -> bool:
@@ -164,8 +150,7 @@ def checked_pose(record: Record, rotation: np.ndarray, center: list[float]) -> P
 
 
 def part(document: Record, key: str, program: str) -> Record:
-    """One of the parts of a file, which must be there and not empty. Raises ProblemError: it is not; the message says
-    what the file has."""
+    """A part of a file, which must be there and not empty. Raises ProblemError: it is not; says what there is."""
     if document.has(key) and document.value[key] not in ([], {}, ""):
         return document.get(key)
     names = ("views", "intrinsics", "extrinsics", "poses", "structure")

@@ -75,8 +75,7 @@ class Record:
             yield key, Record(value, self.name, f"{what} {display_name(key)}")
 
     def numbered(self, key: str, what: str, inside: str = "") -> Iterator[tuple[int, Record]]:
-        """Rows of a list, or the values of their key `inside`, by their numbers at a key, called `what NUMBER`. Raises
-        ProblemError."""
+        """Rows of a list, or their `inside`, by their numbers at a key, called `what NUMBER`. Raises ProblemError."""
         for row in self.rows():
             number = row.get(key).integer()
             yield number, (row.get(inside) if inside else row).called(f"{what} {number}")

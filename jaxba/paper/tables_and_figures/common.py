@@ -14,7 +14,7 @@ from jaxba.paper.agents import BEST, OURS, PRINTED
 from jaxba.paper.claims import Claim, Statement, judge
 from jaxba.paper.real_problems import Problems
 from jaxba.paper.results import Row
-from jaxba.paper.runner import Method, Runner, method_named
+from jaxba.paper.runner import TEST, Method, Runner, method_named
 from jaxba.solver.record import Record
 
 CLASSIC, CERES = "classic", "ceres"
@@ -65,26 +65,13 @@ def with_twin(label: str, made: Callable[..., Method], *of: str, paper: float, p
 class Part:
     """Methods on one set of problems."""
 
-    problems: Problems
-    """The problems, or `SCENES`."""
-
+    problems: Problems  # the problems, or `SCENES`
     lines: Sequence[Line]
-    """Methods."""
-
-    statements: Sequence[Statement] = ()
-    """Claims about them; `{}` stands for the name of the problems."""
-
-    more: Callable[[Runner], Iterable[Claim]] = lambda _: ()
-    """Claims that rows do not tell."""
-
-    repeats: int = 0
-    """Repeats of each solve; as in the configuration if 0."""
-
-    limit: int = ITERATION_LIMIT
-    """Limit of linear solves."""
-
-    each: bool = False
-    """Whether a second table has the iterations on each problem."""
+    statements: Sequence[Statement] = ()  # `{}` stands for the name of the problems
+    more: Callable[[Runner], Iterable[Claim]] = lambda _: ()  # claims that rows do not tell
+    repeats: int = 0  # repeats of each solve; as in the configuration if 0
+    limit: int = ITERATION_LIMIT  # limit of linear solves
+    each: bool = False  # whether a second table has the iterations on each problem
 
     def run(self, runner: Runner) -> None:
         """Computes the results that are missing."""
@@ -111,7 +98,7 @@ class Part:
         if problems.reason or not rows:
             return [f"**{problems.name}**: {f'{problems.reason}.' if problems.reason else NOT_YET}"]
         if problems is SCENES:
-            count = runner.number_of_scenes()
+            count = max((len(p.iterations) for p in runner.store.plays if p.scenes == TEST), default=0)
             title = f"**{count} synthetic scenes** of the kind that the agents train on, none of them seen in training:"
         else:
             names = [source.name for source in problems.sources]
@@ -130,20 +117,11 @@ class Part:
 class Table:
     """A table or figure of the paper."""
 
-    name: str
-    """Name for `--only`."""
-
-    title: str
-    """Description for `--list`."""
-
-    heading: str
-    """Heading of its section."""
-
-    text: Callable[[Runner], str]
-    """Paragraph above the tables."""
-
-    parts: Callable[[Runner], list[Part]]
-    """Sets of problems with their methods and claims."""
+    name: str  # name for `--only`
+    title: str  # description for `--list`
+    heading: str  # of its section
+    text: Callable[[Runner], str]  # paragraph above the tables
+    parts: Callable[[Runner], list[Part]]  # sets of problems with their methods and claims
 
     def run(self, runner: Runner) -> None:
         """Computes the results that are missing."""

@@ -1,5 +1,4 @@
-"""Small problems, and the figures: lambda over the iterations, performance profiles, convergence. Their curves are in a
-page beside the report (`report.FIGURES`)."""
+"""Small problems, and the figures (curves in `report.FIGURES`): lambdas, performance profiles, convergence."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ PAPER_SIZE = 5
 
 
 def small_scene(size: int, seed: int) -> Source:
-    """A random scene with as many points as cameras, in which every camera observes every point. Its start has the true
-    focal lengths."""
+    """A random scene of as many points as cameras, all seen by all. Its start has the true focal lengths."""
 
     def make() -> BundleProblem:
         config = SceneConfig(

@@ -1,5 +1,4 @@
-"""The tables of real problems: average efficiency on KITTI and BAL, agents trained on synthetic scenes, and BAL's
-families in seconds."""
+"""Tables of real problems: efficiency on KITTI and BAL, agents of synthetic scenes, BAL's families in seconds."""
 
 from __future__ import annotations
 
@@ -20,8 +19,7 @@ TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"
 """Names of our agents, trained elsewhere."""
 
 MSE_DIFFERENCE = 0.003
-"""Largest difference of the mean squared errors of DeepLM's solver with and without ours. Source: the paper, after the
-table on BAL."""
+"""Largest difference of DeepLM's mean squared errors with and without ours. Source: the paper, after BAL's table."""
 
 
 def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
@@ -38,9 +36,6 @@ def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
         "The agents of this table are trained on windows of up to 10 cameras and 40 points, with the steps that they "
         f"drive, and judged on problems that the windows are not of: {'; '.join(parts)}."
     )
-
-
-# Average efficiency on KITTI
 
 
 def _kitti(runner: Runner) -> list[Part]:
@@ -73,9 +68,6 @@ def _kitti_text(runner: Runner) -> str:
         "As in the paper, poses and points are unknown and the lens is known. "
         + _trained_elsewhere(runner, real_problems.find(runner.config.real.kitti).sources)
     )
-
-
-# Average efficiency on BAL
 
 
 def _bal(runner: Runner) -> list[Part]:
@@ -119,9 +111,6 @@ def _same_error(runner: Runner) -> Iterable[claims.Claim]:
     yield claims.error_claim("BAL: ours does not change DeepLM's mean squared error", MSE_DIFFERENCE, excess)
 
 
-# Trained on synthetic scenes
-
-
 def _synthetic(runner: Runner) -> list[Part]:
     """Source: the paper, tables "Average efficiency improvement" and "Average acceleration using synthetic data for
     training"."""
@@ -161,8 +150,6 @@ def _synthetic_text(runner: Runner) -> str:
         "its cameras, those of KITTI with known lenses."
     )
 
-
-# BAL's families against Ceres with conjugate gradients, in seconds
 
 FAMILY_SECONDS = {
     "Trafalgar": (65.1, 10.2, 5.6),
