@@ -43,11 +43,11 @@ from jaxba.damping.guard import action_of
 from jaxba.damping.learned import AgentPolicy, ConstantAction
 from jaxba.game.env import Episode, Game, GameConfig, make_game
 from jaxba.game.evaluate import best_constant_action
-from jaxba.runtime.groups import step_groups
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import Bank, BankConfig, make_banks
 from jaxba.game.statistics import paired_ratio
 from jaxba.runtime import process
+from jaxba.runtime.groups import step_groups
 from jaxba.typing import register_pytree
 
 DECADES = (-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0)

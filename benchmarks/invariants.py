@@ -27,13 +27,13 @@ from jaxtyping import Bool, Float
 
 from jaxba import LMState
 from jaxba.damping import POLICIES, DampingPolicy, ProblemInfo
-from jaxba.runtime.groups import step_groups
 from jaxba.game.random_scenes import SceneClass, SceneFamily, Scenes, make_scenes
 from jaxba.game.scene_bank import info_of, initial_costs
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import lm_step
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
+from jaxba.runtime.groups import step_groups
 from jaxba.solver.names import parse_solver
 
 CLASSES: dict[SceneFamily, tuple[int, int]] = {"wide": (8, 24), "paper": (8, 12)}

@@ -72,9 +72,11 @@ def windows(count: int, seed: int = 0) -> Iterator[BundleProblem]:
 def ceres_seconds(problems: list[BundleProblem]) -> tuple[list[float], list[float]]:
     """Ceres' seconds and final costs; none without the program."""
     program, seconds, costs = peers.program(), [], []
+    if program is None:
+        return seconds, costs
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "window.txt"
-        for problem in problems if program else ():
+        for problem in problems:
             jaxba.write_problem(problem, path)
             found = peers.run(program, path, "DENSE_SCHUR", 1, 100)
             seconds.append(found.total_s)
@@ -105,9 +107,7 @@ def main() -> None:
     solved = [one for one in found if not isinstance(one, Exception)]
     half = len(times) // 2
     steady = (len(times) - half) / (times[-1] - times[half - 1])
-    print(
-        f"solve_many: {len(times) / times[-1]:.1f} a second, {steady:.1f} in the second half; first result {times[0]:.1f} s"
-    )
+    print(f"solve_many: {len(times) / times[-1]:.1f} a second, {steady:.1f} in the second half, first {times[0]:.1f} s")
     cells = {one.capacity for one in solved if one.capacity is not None and one.capacity.fixed}
     sizes = np.array([Sizes.of(one)[:4] for one in problems])
     cell = np.array(

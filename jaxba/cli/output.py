@@ -59,14 +59,19 @@ def check_storable(output: str | None, problem: BundleProblem, source: str | Non
             check_bal_lenses(problem, output)
 
 
+def store(output: str, problem: BundleProblem, source: str | None) -> None:
+    """Writes a solution. Raises OSError, ProblemError: it cannot be written."""
+    if _is_like_source(output, source):
+        write_colmap(problem, output, like=source)
+    else:
+        write_problem(problem, output)
+
+
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
     """Writes the solution, and prints what was written and what the file cannot store. Raises UsageError: it fails."""
     model, like = is_model(output, source), _is_like_source(output, source)
     try:
-        if like:
-            write_colmap(problem, output, like=source)
-        else:
-            write_problem(problem, output)
+        store(output, problem, source)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
     if model and not like:

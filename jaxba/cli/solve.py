@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
@@ -66,6 +67,10 @@ class Problem:
     """BAL, Bundler (.out) or VisualSFM (.nvm) file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision, plain
     or .bz2, .gz, .xz; folder of a COLMAP model; name of a downloaded BAL problem such as ladybug-49 (see jaxba-data);
     or - for a file on standard input. Default: a random scene."""
+
+    more: Annotated[tuple[str, ...], "[PROBLEM ...]", tyro.conf.Positional] = ()
+    """Further problems, solved as few programs: of each one line in OUTPUT/costs.csv. A folder stands for the problems
+    in it."""
 
     intrinsics: Intrinsics = DEFAULTS.intrinsics
     """fixed: keep focal lengths and distortion."""
@@ -178,7 +183,10 @@ class Output:
     output: Annotated[str | None, "FILE"] = None
     """Solution in BAL format, compressed by its ending; .out: Bundler's format; .ply: for a viewer; -: standard output.
     An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem is one, except *.txt, *.bal,
-    *.out, *.ply, *.bz2, *.gz and *.xz."""
+    *.out, *.ply, *.bz2, *.gz and *.xz. Of several problems: the folder of their solutions."""
+
+    resume: bool = False
+    """Go on with several problems where an earlier run with this output has ended."""
 
     covariance: Annotated[str | None, "FILE"] = None
     """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge, or constants or priors that fix
@@ -231,7 +239,7 @@ def with_settings(path: str, words: Sequence[str]) -> Arguments:
 
     try:
         data = {str(key).replace("-", "_"): value for key, value in configurations.read_file(Path(path), path).items()}
-        if none := {"problem", "settings"} & set(data):
+        if none := {"problem", "more", "settings"} & set(data):
             raise configurations.SettingsError(f"{path}: {none.pop()} stands on the command line alone")
         given = settings.read(Arguments, data)
     except configurations.SettingsError as error:
@@ -323,6 +331,13 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
+    problems = [name for name in (args.problem, *args.more) if name]
+    if args.more or args.resume or (args.problem and os.path.isdir(args.problem)):
+        from jaxba.cli import several
+
+        if paths := several.inputs(problems):
+            return several.solve_all(args, paths, functools.partial(_constrained, args), policy, options)
+    common.require(not args.resume, "--resume is for several problems")
     from jaxba.runtime.distributed import together
 
     path, problem = together(lambda: _checked(args))
@@ -369,14 +384,19 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     if args.view:
         common.check_extra(view.VIEWER)
     with common.notes_printed():
-        problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
-        problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
+        problem = _constrained(args, path)
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and not problem.residuals:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
     return path, problem
+
+
+def _constrained(args: Arguments, path: str | None) -> BundleProblem:
+    """A problem with what is constant or measured; without a path the built-in scene."""
+    problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
+    return constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
 
 
 def _path(problem: str | None) -> str | None:

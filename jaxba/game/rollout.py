@@ -89,15 +89,15 @@ def _play(
         converged = converged_in_cost(step, ftol)
         return carry, (step, converged), converged | (carry.iteration >= limit)
 
-    def note(found: Trajectories, scene: Array, carry: Carry, record: Any, _: Array) -> Trajectories:
+    def note(found: Any, scene: Array, carry: Carry, record: Any, _: Array) -> Any:
         (step, converged), iteration = record, carry.iteration
-        return Trajectories(
+        return found._replace(
             costs=found.costs.at[scene, iteration - 1].set(step.cost, mode="drop"),
             dampings=found.dampings.at[scene, iteration - 1].set(step.damping, mode="drop"),
             iterations=found.iterations.at[scene].set(iteration, mode="drop"),
             converged=found.converged.at[scene].set(converged, mode="drop"),
         )
 
-    rows = jnp.zeros((count, limit), bank.initial_cost.dtype)
-    nothing = Trajectories(rows, rows, jnp.zeros(count, jnp.int32), jnp.zeros(count, bool))
-    return refill(count, count, min(LANES, count), fresh, advance, note, nothing)
+    rows = np.zeros((count, limit), bank.initial_cost.dtype)
+    nothing = Trajectories(rows, rows, np.zeros(count, np.int32), np.zeros(count, bool))
+    return refill(count, count, min(LANES, count), fresh, advance, note, jax.tree.map(jnp.asarray, nothing))

@@ -26,6 +26,7 @@ from jaxba.runtime.groups import step_groups
 from jaxba.solver.iteration import Carry, begin, iterate, problem_info
 from jaxba.solver.loop import loop_from
 from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
 
 Found = TypeVar("Found")
 
@@ -47,8 +48,8 @@ class Starts(NamedTuple):
     """Problems of one shape, along a leading axis."""
 
     layout: Layout
-    cameras: Float[Array, "rows cameras parameters"]
-    points: Float[Array, "rows points 3"]
+    cameras: Float[AnyArray, "rows cameras parameters"]
+    points: Float[AnyArray, "rows points 3"]
 
 
 def solve_rows(
@@ -95,7 +96,7 @@ def solve_rows(
         carry, step = one(row, carry)
         return carry, step, carry.termination != Termination.RUNNING
 
-    def note(found: Ends, row: Row, carry: Carry, step: StepInfo, _: Any) -> Ends:
+    def note(found: Ends, row: Int[Array, " lanes"], carry: Carry, step: StepInfo, _: Any) -> Ends:
         put = lambda every, own: every.at[row].set(own, mode="drop")
         return Ends(
             jax.tree.map(put, found.state, carry.state),

@@ -32,7 +32,7 @@ from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import check_problem, placed
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.solve import Solution, solution_of, solve
-from jaxba.structure.cells import Sizes, cell_for, choose_cells
+from jaxba.structure.cells import NO_CELL, Sizes, cell_for, choose_cells
 
 BANK = 32
 """Problems of a bank for each lane; on a CPU it has one lane, and half a second of work."""
@@ -76,7 +76,8 @@ def solve_many(
     rows of each residual.
 
     Args:
-        problems: starts of the optimisation; read by the thread that asks for results.
+        problems: starts of the optimisation, read by the thread that asks for results; an exception among them, for one
+            that could not be made, is its own result.
         policy: as for `solve`.
         options: as for `solve`; they hold for all.
 
@@ -92,9 +93,11 @@ def solve_many(
 
 def _results(problems: Iterable[BundleProblem], policy: DampingPolicy, options: SolveOptions) -> Iterator[Result]:
     stream = iter(problems)
-    for first in itertools.islice(stream, 1):
-        yield _alone(policy, options, first)
-    many = _Many(policy, options, len(problems) - 1 if isinstance(problems, Sized) else None)
+    for first in stream:
+        yield (result := _alone(policy, options, first))
+        if isinstance(result, Solution):
+            break
+    many = _Many(policy, options, len(problems) - 1 if isinstance(problems, Sized) else ENDLESS)
     try:
         waiting = deque[Future[Result]]()
         for problem in stream:
@@ -108,8 +111,10 @@ def _results(problems: Iterable[BundleProblem], policy: DampingPolicy, options: 
         many.close()
 
 
-def _alone(policy: DampingPolicy, options: SolveOptions, problem: BundleProblem) -> Result:
+def _alone(policy: DampingPolicy, options: SolveOptions, problem: Any) -> Result:
     try:
+        if isinstance(problem, Exception):
+            raise problem
         return solve(problem, policy, options)
     except Exception as error:
         return error
@@ -125,8 +130,8 @@ class _Job(NamedTuple):
 class _Many:
     """Cells, banks that are being filled, and the threads that solve them."""
 
-    def __init__(self, policy: DampingPolicy, options: SolveOptions, expected: int | None) -> None:
-        """`expected`: how many problems come; None if that is not known."""
+    def __init__(self, policy: DampingPolicy, options: SolveOptions, expected: int) -> None:
+        """`expected`: how many problems come."""
         self._policy, self._options, self._expected = policy, options, expected
         here = jax.local_devices()
         on_cpu = here[0].platform == "cpu"
@@ -142,18 +147,21 @@ class _Many:
         plain = options.linear_solver in ("auto", "explicit") and not options.step_options(policy).method
         self._in_lanes = plain and options.max_iterations > 0 and options.devices in (None, 1)
 
-    def add(self, problem: BundleProblem) -> Future[Result]:
-        """The result that a problem will have."""
+    def add(self, problem: Any) -> Future[Result]:
+        """The result that a problem will have; perhaps that it is none."""
         job = _Job(problem, Future())
         try:
+            if isinstance(problem, Exception):
+                raise problem
             check_problem(problem)
-            sizes = _sizes(problem) if self._in_lanes else None
+            sizes = _sizes(problem)
         except Exception as error:
             job.result.set_result(error)
             return job.result
-        if sizes is None:
+        cell = cell_for(sizes, self._cells)
+        if sizes.too_large or not self._in_lanes:
             self._begin(self._solve_alone, job)
-        elif (cell := cell_for(sizes, self._cells)) is not None:
+        elif cell != NO_CELL:
             self._fill(cell, job)
             if self._busy < len(self._devices):
                 self._submit(max(self._filling, key=lambda cell: len(self._filling[cell])))
@@ -184,14 +192,13 @@ class _Many:
         unsorted, self._unsorted, self._began = self._unsorted, [], time.monotonic()
         if not unsorted:
             return
-        expected = self._expected if self._expected is not None else ENDLESS * endless
-        every, times = [sizes for _, sizes in unsorted], max(1.0, expected / len(unsorted))
+        every, times = [sizes for _, sizes in unsorted], max(1.0, endless * self._expected / len(unsorted))
         cells = choose_cells(every, times)
         members = Counter(cell_for(sizes, cells) for sizes in every)
         cells = [cell for cell in cells if members[cell] * times >= WORTH]
         for job, sizes in unsorted:
             cell = cell_for(sizes, cells)
-            if cell is None:
+            if cell == NO_CELL:
                 self._begin(self._solve_alone, job)
             else:
                 self._fill(cell, job)
@@ -289,9 +296,9 @@ class _Program:
         return ends
 
 
-def _sizes(problem: BundleProblem) -> Sizes | None:
+def _sizes(problem: BundleProblem) -> Sizes:
     """Those of a problem as it is laid out."""
-    return Sizes.of(placed(problem).here if problem.rigs is not None or problem.residuals else problem)
+    return Sizes.of(placed(problem).here if problem.rigs or problem.residuals else problem)
 
 
 def _solution(setup: Setup, end: Ends, seconds: float) -> Result:

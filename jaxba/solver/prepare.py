@@ -158,19 +158,17 @@ def set_up(
                 refinement=replace(step.refinement, camera_rounds=0, pattern_moves=0),
             )
         observations = ObservationOrder.of(here)
-        asked, on_host = options.linear_solver, capacity is not None
-        if on_host:
-            asked = "explicit"
-        elif len(devices) == 1 and not step.method and asked in ("auto", "explicit") and _pads(observations, options):
-            # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up to the
-            # largest capacity the explicit solver is never slow
+        asked, given = options.linear_solver, bool(capacity)
+        may_pad = len(devices) == 1 and not step.method and asked in ("auto", "explicit")
+        if may_pad and not given and _pads(observations, options):
             capacity = capacity_of(here, observations)
-            asked = asked if capacity is None else "explicit"
+        if capacity:  # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up
+            asked = "explicit"  # to the largest capacity it is never slow
         step = choose_linear_solver(here, step, asked, observations, len(devices))
         shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
-        grid = not on_host  # else a shape would depend on more than the capacity
-        layout = build_layout(here, step, capacity, observations, grid=grid) if shards is None else shards.first
-        layout = layout if shards or on_host else jax.device_put(layout)
+        grid = not given  # else a shape would depend on more than the capacity
+        layout = shards.first if shards else build_layout(here, step, capacity, observations, grid=grid)
+        layout = layout if shards or given else jax.device_put(layout)
         start = (here.cameras, here.points) if capacity is None else padded_parameters(here, capacity)
         setup_s = time.perf_counter() - started
     return Setup(problem, away, found, layout, step, policy, capacity, start, dtype, setup_s, shards)

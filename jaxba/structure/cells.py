@@ -21,9 +21,8 @@ ROUNDED = np.array([1, 16, 64, 256])
 """Sizes of cells are multiples of these, so that later problems fit."""
 
 FIXED_S, CUBE_S, EACH_S = 5e-5, 2.5e-11, np.array([1e-5, 7e-7, 2.7e-7, 6e-9])
-"""Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that is padding. Measured
-on windows of 5 to 20 cameras, on a core of an x86-64 processor with AVX-512. Batches of pairs without any cost nothing,
-so that the work for pairs themselves is the same in every cell."""
+"""Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that is padding, on
+windows of 5 to 20 cameras, x86-64 with AVX-512. The work for the pairs that there are is the same in every cell."""
 
 ITERATIONS = 20
 """Iterations of a solve, as far as that matters for the number of cells."""
@@ -42,15 +41,18 @@ class Sizes(NamedTuple):
     exactly: int  # number of cameras that its cell must have, since not all that it holds can be padded; 0: any
 
     @classmethod
-    def of(cls, problem: BundleProblem) -> Sizes | None:
-        """Those of a problem as it is laid out; None if it is too large for a cell."""
+    def of(cls, problem: BundleProblem) -> Sizes:
+        """Those of a problem as it is laid out."""
         observations = ObservationOrder.of(problem)
         cameras, tracks = observations.num_cameras, observations.tracks
         pairs, slots = observations.num_pairs + observations.num_repeated_pairs, slots_for(tracks)
-        if cameras > MAX_CAMERAS or slots > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
-            return None
-        general = problem.lenses is not None or problem.rigs is not None or bool(problem.residuals)
+        general = problem.lenses or problem.rigs or problem.residuals
         return cls(cameras, len(tracks), slots, pairs, cameras if general else 0)
+
+    @property
+    def too_large(self) -> bool:
+        """Whether it has no place in a cell."""
+        return self.cameras > MAX_CAMERAS or self.slots > MAX_OBSERVATIONS or self.pairs > MAX_PAIRS
 
     @property
     def capacity(self) -> Capacity:
@@ -71,7 +73,7 @@ def work(sizes: Int[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
 def choose_cells(seen: Iterable[Sizes], times: float) -> list[Sizes]:
     """Cells for problems of such sizes, of which `times` as many are to come."""
     kinds: dict[int, list[Sizes]] = {}
-    for one in seen:
+    for one in (sizes for sizes in seen if not sizes.too_large):
         kinds.setdefault(one.exactly, []).append(one)
     return [cell for each in kinds.values() for cell in _cells_of_kind(each, times)]
 
@@ -98,10 +100,14 @@ def _cells_of_kind(seen: Sequence[Sizes], times: float) -> list[Sizes]:
     for cut in reversed(cuts):
         ends.append(int(cut[ends[-1]]))
     cells = (rows[first:last].max(axis=0) for first, last in itertools.pairwise(sorted({0, *ends})))
-    return [Sizes(*map(int, cell), seen[0].exactly) for cell in cells]
+    return [Sizes._make([*cell.tolist(), seen[0].exactly]) for cell in cells]
 
 
-def cell_for(sizes: Sizes, cells: Sequence[Sizes]) -> Sizes | None:
-    """The cell in which a problem is the least work; None if it fits none."""
+NO_CELL = Sizes(0, 0, 0, 0, 0)
+"""Of problems that fit none."""
+
+
+def cell_for(sizes: Sizes, cells: Sequence[Sizes]) -> Sizes:
+    """The cell in which a problem is the least work, or `NO_CELL`."""
     fitting = [cell for cell in cells if sizes.fits(cell)]
-    return min(fitting, key=lambda cell: float(work(np.array([cell[:4]]))[0]), default=None)
+    return min(fitting, key=lambda cell: float(work(np.array([cell[:4]]))[0]), default=NO_CELL)

@@ -146,7 +146,7 @@ def pair_layout(
         array[position] = row_index[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
     most_of_block = None if capacity is None else -(-room.most // width)
-    loosest = capacity is not None and capacity.fixed
+    loosest = bool(capacity and capacity.fixed)
     sums, levels, by_sums = _batch_sums(chunks, batches, batch, most_of_block, agreement, loosest=loosest)
     keys = keys[by_sums]
     table = None

@@ -1,0 +1,184 @@
+"""`jaxba-solve` with several problems: by `jaxba.solve_many`, with a file of costs from which a run goes on."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxba.cli import common
+from jaxba.cli.output import store
+from jaxba.cli.overwriting import check_apart, problem_files
+from jaxba.damping import DampingPolicy
+from jaxba.io import is_colmap
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.runtime.atomic import write_text
+from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
+from jaxba.solver.many import Result, solve_many
+from jaxba.solver.options import SolveOptions
+from jaxba.solver.solve import Solution
+
+COSTS = "costs.csv"
+"""Name of the file of costs in the folder of solutions."""
+
+FOR_ONE = ("log", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices")
+"""Options of a single problem."""
+
+PROGRESS_S = 0.2, 10.0
+"""Seconds between lines of progress on a terminal, where each replaces the last, and elsewhere."""
+
+
+class Row(NamedTuple):
+    """A row of the file of costs."""
+
+    problem: str
+    cameras: int | str = ""
+    points: int | str = ""
+    observations: int | str = ""
+    initial_cost: float | str = ""  # pixels^2
+    final_cost: float | str = ""
+    iterations: int | str = ""
+    end: str = ""  # why it ended, or why there is no solution
+
+    @classmethod
+    def of(cls, name: str, result: Result) -> Row:
+        """That of a result."""
+        if not isinstance(result, Solution):
+            return cls(name, end=f"error: {' '.join(str(result).split())}")
+        problem = result.problem
+        sizes = problem.num_cameras, problem.num_points, problem.num_observations
+        return cls(name, *sizes, result.initial_cost, result.final_cost, result.iterations, result.termination.reason)
+
+
+def inputs(problems: Sequence[str]) -> list[str]:
+    """The paths of several problems; of a folder that is no COLMAP model what it holds. Empty for a single problem."""
+    if len(problems) == 1 and not (Path(problems[0]).is_dir() and not is_colmap(problems[0])):
+        return []
+    found: list[str] = []
+    for path in problems:
+        inside = sorted(Path(path).iterdir()) if Path(path).is_dir() and not is_colmap(path) else None
+        found += [path] if inside is None else [str(one) for one in inside if one.is_file() or is_colmap(one)]
+    return found
+
+
+def solve_all(
+    args: Any,
+    paths: Sequence[str],
+    read: Callable[[str], BundleProblem],
+    policy: DampingPolicy,
+    options: SolveOptions,
+) -> int:
+    """Solves problems, `read` from their paths, and writes solutions under their names. One that fails is one line, and
+    the others go on. Exit status: 0, 2 if any has failed, 130 after Ctrl-C. Raises UsageError: the folder or the
+    options."""
+    given = [f"--{name.replace('_', '-')}" for name in FOR_ONE if getattr(args, name)]
+    common.require(not given, f"{', '.join(given)}: for one problem, not for {len(paths)}")
+    common.require(bool(paths), "there is no problem in that folder")
+    common.require(bool(args.output) or not args.resume, "--resume goes on with the folder of --output")
+    names = _names(paths)
+    folder = Path(args.output) if args.output else None
+    done = _begin(folder, paths, names, resume=args.resume) if folder else {}
+    left = [(path, name) for path, name in zip(paths, names, strict=True) if name not in done]
+    if done:
+        common.print_line(f"{len(done)} of {len(paths)} are there already")
+    common.prepare_process()
+    began, shown, rows = time.monotonic(), -1e9, list[Row]()
+    every, end = (PROGRESS_S[0], "") if sys.stderr.isatty() else (PROGRESS_S[1], "\n")
+    results = solve_many(_Problems([path for path, _ in left], read), policy, options)
+    with common.notes_printed(), Interrupt("problem", graceful=True) as interrupt:
+        for (path, name), result in zip(left, results, strict=False):
+            if folder and isinstance(result, Solution):
+                result = _stored(folder / name, result, path)
+            rows.append(Row.of(name, result))
+            if folder:
+                _append(folder / COSTS, rows[-1])
+            now = time.monotonic()
+            if not isinstance(result, Solution):
+                text = rows[-1].end.removeprefix("error: ")
+                common.print_error(text if text.startswith(path) else f"{path}: {text}")
+            elif now - shown > every:
+                rate, shown = len(rows) / (now - began), now
+                text = f"{len(rows)} of {len(left)}, {rate:.1f} a second"
+                print(text if end else f"\r{text} ", end=end, file=sys.stderr, flush=True)
+            if interrupt.requested:
+                break
+    print(end="" if end else "\n", file=sys.stderr)
+    failed = sum(row.end.startswith("error: ") for row in rows)
+    solved = [row for row in rows if not row.end.startswith("error: ")]
+    total = lambda name: sum(float(getattr(row, name)) for row in solved)
+    common.print_line(
+        f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
+        f"cost {total('initial_cost'):.6g} -> {total('final_cost'):.6g} in all, "
+        f"{total('iterations') / max(1, len(solved)):.1f} iterations each"
+    )
+    if folder:
+        common.print_line(f"wrote {folder / COSTS} and the solutions beside it")
+    if interrupt.requested and len(rows) < len(left):
+        common.print_line(f"{len(left) - len(rows)} are left: --resume goes on")
+        return INTERRUPTED
+    return common.BAD_INPUT if failed else 0
+
+
+class _Problems:
+    """Problems that are read when their turn comes; what cannot be read is the error itself."""
+
+    def __init__(self, paths: Sequence[str], read: Callable[[str], BundleProblem]) -> None:
+        self._paths, self._read = paths, read
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __iter__(self) -> Iterator[Any]:
+        for path in self._paths:
+            try:
+                yield self._read(path)
+            except (ProblemError, OSError) as error:
+                yield error
+
+
+def _names(paths: Sequence[str]) -> list[str]:
+    """Names of solutions: paths below the folder that all have in common."""
+    absolute = [os.path.abspath(path) for path in paths]
+    common_folder = os.path.commonpath([os.path.dirname(path) for path in absolute])
+    names = [os.path.relpath(path, common_folder) for path in absolute]
+    twice = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else ()
+    common.require(not twice, f"{next(iter(twice), '')}: named twice")
+    return names
+
+
+def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], *, resume: bool) -> dict[str, list[str]]:
+    """Makes the folder, and gives the rows that it holds already. A last line that was cut is dropped."""
+    common.check_folder("--output", str(folder))
+    written = {str(path): [folder / name] for path, name in zip(paths, names, strict=True)}
+    check_apart(written, {"a problem": [file for path in paths for file in problem_files(path)]})
+    folder.mkdir(exist_ok=True)
+    costs, rows = folder / COSTS, dict[str, list[str]]()
+    if costs.exists():
+        common.require(resume, f"--output {folder}: holds {COSTS} of an earlier run; --resume goes on with it")
+        content = costs.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1].decode()
+        rows = {row[0]: row for row in list(csv.reader(whole.splitlines()))[1:] if not row[-1].startswith("error: ")}
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([Row._fields, *rows.values()])
+    write_text(costs, text.getvalue())
+    return rows
+
+
+def _append(costs: Path, row: Row) -> None:
+    with costs.open("a", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerow(row)
+
+
+def _stored(output: Path, solution: Solution, source: str) -> Result:
+    """The solution after it was written, or why it could not be."""
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        store(str(output), solution.problem, source)
+        return solution
+    except (OSError, ProblemError) as error:
+        return error

@@ -1,0 +1,102 @@
+"""`jaxba-solve` with several problems: a solution and a line for each, whatever becomes of the others."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+import jaxba
+from jaxba.cli.several import COSTS
+from jaxba.cli.solve import run
+
+ASKED = ("--policy", "ceres", "--max-iterations", "5", "--compilation", "quick")
+
+
+@pytest.fixture
+def problems(tmp_path):
+    """Three problems in a folder."""
+    folder = tmp_path / "given"
+    folder.mkdir()
+    for seed in range(3):
+        jaxba.write_problem(jaxba.random_scene(jaxba.scene_like("tiny"), seed), folder / f"scene-{seed}.txt.gz")
+    return folder
+
+
+def rows(folder) -> list[dict[str, str]]:
+    with (folder / COSTS).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_each_problem_of_a_folder_has_a_solution_and_a_line(problems, tmp_path, capsys):
+    output = tmp_path / "solved"
+    assert run([str(problems), "--output", str(output), *ASKED]) == 0
+    assert "3 problems solved, 0 failed" in capsys.readouterr().out
+    found = rows(output)
+    assert [row["problem"] for row in found] == [f"scene-{seed}.txt.gz" for seed in range(3)]
+    for row in found:
+        alone = jaxba.solve(
+            jaxba.read_problem(problems / row["problem"]),
+            "ceres",
+            jaxba.SolveOptions(max_iterations=5, compilation="quick"),
+        )
+        np.testing.assert_allclose(float(row["initial_cost"]), alone.initial_cost, rtol=1e-9)
+        np.testing.assert_allclose(float(row["final_cost"]), alone.final_cost, rtol=1e-9)
+        assert int(row["iterations"]) == alone.iterations
+        written = jaxba.read_problem(output / row["problem"])
+        np.testing.assert_allclose(written.points, alone.problem.points, rtol=1e-7, atol=1e-9)
+
+
+def test_one_that_fails_is_one_line_and_the_others_go_on(problems, tmp_path, capsys):
+    (problems / "bad.txt").write_text("2 1 2\nthese are no numbers\n")
+    output = tmp_path / "solved"
+    assert run([str(problems), "--output", str(output), *ASKED]) == 2
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "bad.txt" in errors[0]
+    assert [bool(row["final_cost"]) for row in rows(output)] == [False, True, True, True]
+    assert not (output / "bad.txt").exists()
+
+
+def test_a_run_goes_on_where_it_was_also_after_a_line_that_was_cut(problems, tmp_path, capsys):
+    output, paths = tmp_path / "solved", sorted(map(str, problems.iterdir()))
+    assert run([*paths[:2], "--output", str(output), *ASKED]) == 0
+    first = rows(output)
+    assert run([*paths, "--output", str(output), *ASKED]) == 2
+    assert "--resume" in capsys.readouterr().err
+    costs = output / COSTS
+    costs.write_bytes(costs.read_bytes()[:-20])  # killed while it wrote the second line
+    (output / first[0]["problem"]).unlink()  # to see that it is not solved again
+    assert run([*paths, "--output", str(output), "--resume", *ASKED]) == 0
+    assert "1 of 3 are there already" in capsys.readouterr().out
+    found = rows(output)
+    assert [row["problem"] for row in found] == [f"scene-{seed}.txt.gz" for seed in range(3)]
+    assert found[0] == first[0]
+    assert found[1]["final_cost"]
+    assert sorted(one.name for one in output.iterdir()) == [COSTS, "scene-1.txt.gz", "scene-2.txt.gz"]
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--log", "log.json"], "--log"),
+        (["--covariance", "c.npz"], "--covariance"),
+        (["--devices", "2"], "--devices"),
+        (["--resume"], "--output"),
+    ],
+)
+def test_what_is_for_one_problem_is_refused_for_several(problems, more, said, capsys):
+    assert run([*sorted(map(str, problems.iterdir())), *more]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_no_problem_is_written_over_and_none_is_named_twice(problems, capsys):
+    paths = sorted(map(str, problems.iterdir()))
+    assert run([*paths, "--output", str(problems), *ASKED]) == 2
+    assert "would be replaced" in capsys.readouterr().err
+    assert run([paths[0], paths[0], "--output", str(problems / "new")]) == 2
+    assert "named twice" in capsys.readouterr().err
+    assert run(["--resume"]) == 2
