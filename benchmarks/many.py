@@ -58,7 +58,7 @@ def windows(count: int, seed: int = 0) -> Iterator[BundleProblem]:
         most = int(np.exp(rng.uniform(*np.log(POINTS))))
         try:
             window = sub_problem(problem, chosen)
-            points = rng.permutation(window.num_points)[:most]
+            points = rng.permutation(window.num_points)[:most].tolist()
             window = sub_problem(window, range(window.num_cameras), points)
             seen = np.bincount(window.camera_index, minlength=window.num_cameras)
             window = sub_problem(window, np.flatnonzero(seen >= FEWEST))

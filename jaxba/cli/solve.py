@@ -1,4 +1,4 @@
-"""`jaxba-solve`: bundle adjustment of one problem."""
+"""`jaxba-solve`: bundle adjustment of a problem, or of several."""
 
 from __future__ import annotations
 
@@ -64,13 +64,11 @@ class Problem:
     """What is solved."""
 
     problem: Annotated[str | None, "[PROBLEM]", tyro.conf.Positional] = None
-    """BAL, Bundler (.out) or VisualSFM (.nvm) file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision, plain
-    or .bz2, .gz, .xz; folder of a COLMAP model; name of a downloaded BAL problem such as ladybug-49 (see jaxba-data);
-    or - for a file on standard input. Default: a random scene."""
+    """BAL, Bundler (.out), VisualSFM (.nvm), OpenSfM, OpenMVG or AliceVision (.json, .sfm), also .bz2, .gz, .xz; folder
+    of a COLMAP model; a downloaded BAL problem (see jaxba-data); - for standard input. Default: a random scene."""
 
     more: Annotated[tuple[str, ...], "[PROBLEM ...]", tyro.conf.Positional] = ()
-    """Further problems, solved as few programs: of each one line in OUTPUT/costs.csv. A folder stands for the problems
-    in it."""
+    """Further problems; a folder stands for those in it."""
 
     intrinsics: Intrinsics = DEFAULTS.intrinsics
     """fixed: keep focal lengths and distortion."""
@@ -183,10 +181,10 @@ class Output:
     output: Annotated[str | None, "FILE"] = None
     """Solution in BAL format, compressed by its ending; .out: Bundler's format; .ply: for a viewer; -: standard output.
     An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem is one, except *.txt, *.bal,
-    *.out, *.ply, *.bz2, *.gz and *.xz. Of several problems: the folder of their solutions."""
+    *.out, *.ply, *.bz2, *.gz and *.xz. Of several problems: a folder."""
 
     resume: bool = False
-    """Go on with several problems where an earlier run with this output has ended."""
+    """Leave out those of several problems that are there."""
 
     covariance: Annotated[str | None, "FILE"] = None
     """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge, or constants or priors that fix
@@ -228,7 +226,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     except common.UsageError as error:
         return common.print_error(str(error))
     main = lambda args: _run(args if args.settings is None else with_settings(args.settings, words))
-    return common.run_command(Arguments, main, "Bundle adjustment of one problem.", words)
+    return common.run_command(Arguments, main, "Bundle adjustment of a problem, or of several.", words)
 
 
 def with_settings(path: str, words: Sequence[str]) -> Arguments:
