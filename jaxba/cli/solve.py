@@ -64,8 +64,8 @@ class Problem:
     """What is solved."""
 
     problem: Annotated[str | None, "[PROBLEM]", tyro.conf.Positional] = None
-    """BAL, Bundler (.out), VisualSFM (.nvm), OpenSfM, OpenMVG or AliceVision (.json, .sfm), also .bz2, .gz, .xz; folder
-    of a COLMAP model; a downloaded BAL problem (see jaxba-data); - for standard input. Default: a random scene."""
+    """BAL, Bundler, VisualSFM, OpenSfM, OpenMVG or AliceVision file, also .bz2, .gz, .xz; folder of a COLMAP model; a
+    downloaded BAL problem (see jaxba-data); - for standard input. Default: a scene."""
 
     more: Annotated[tuple[str, ...], "[PROBLEM ...]", tyro.conf.Positional] = ()
     """Further problems; a folder stands for those in it."""
@@ -141,7 +141,7 @@ class Step:
 
     pad: Literal["auto", "yes", "no"] = "auto"
     """Pad sizes, so that similar problems share a compiled program, also between calls; for the explicit solver without
-    lenses. auto: up to 64 cameras and 60,000 observations, unless --compilation is full."""
+    lenses. auto: up to 64 cameras and 60,000 observations, not if fully compiled."""
 
     compilation: Compilation = DEFAULTS.compilation
     """quick: compile in a third of the time, for iterations that take two to six times as long. full: the contrary.
@@ -184,11 +184,10 @@ class Output:
     *.out, *.ply, *.bz2, *.gz and *.xz. Of several problems: a folder."""
 
     resume: bool = False
-    """Leave out those of several problems that are there."""
+    """Go on with several problems where it ended."""
 
     covariance: Annotated[str | None, "FILE"] = None
-    """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge, or constants or priors that fix
-    position, orientation and scale."""
+    """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge or priors."""
 
     record: Annotated[str | None, "FILE"] = None
     """Parameters after every step (.npz), for jaxba-view. At most 20,000 points are recorded, evenly sampled."""
