@@ -78,7 +78,6 @@ def solve_all(
     options."""
     given = [f"--{name.replace('_', '-')}" for name in FOR_ONE if getattr(args, name)]
     common.require(not given, f"{', '.join(given)}: for one problem, not for {len(paths)}")
-    common.require(bool(paths), "there is no problem in that folder")
     common.require(bool(args.output) or not args.resume, "--resume goes on with the folder of --output")
     names = _names(paths)
     folder = Path(args.output) if args.output else None

@@ -52,6 +52,9 @@ WORTH = 16
 ENDLESS = 10_000
 """Problems that are expected of a stream of unknown length."""
 
+COMPILING_S = 0.1
+"""Seconds after which a thread that waits for a program looks for other work."""
+
 AHEAD = 4 * SEEN
 """Most problems in memory."""
 
@@ -60,7 +63,7 @@ Result = Solution | Exception
 
 
 def solve_many(
-    problems: Iterable[BundleProblem],
+    problems: Iterable[BundleProblem | Exception],
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
 ) -> Iterator[Result]:
@@ -91,7 +94,9 @@ def solve_many(
     return _results(problems, policy, options)
 
 
-def _results(problems: Iterable[BundleProblem], policy: DampingPolicy, options: SolveOptions) -> Iterator[Result]:
+def _results(
+    problems: Iterable[BundleProblem | Exception], policy: DampingPolicy, options: SolveOptions
+) -> Iterator[Result]:
     stream = iter(problems)
     for first in stream:
         yield (result := _alone(policy, options, first))
@@ -140,7 +145,7 @@ class _Many:
         self._pool, self._busy, self._turn = ThreadPoolExecutor(len(self._devices)), 0, itertools.count()
         self._bank = BANK * self._lanes
         self._unsorted: list[tuple[_Job, Sizes]] = []
-        self._began, self._cells = time.monotonic(), list[Sizes]()
+        self._began, self._seen, self._cells = time.monotonic(), 0, list[Sizes]()
         self._filling: dict[Sizes, list[_Job]] = {}
         self._programs: dict[Any, _Program] = {}
         self._lock = threading.Lock()
@@ -158,14 +163,16 @@ class _Many:
         except Exception as error:
             job.result.set_result(error)
             return job.result
+        self._seen += 1
         cell = cell_for(sizes, self._cells)
         if sizes.too_large or not self._in_lanes:
-            self._begin(self._solve_alone, job)
+            self._begin([job], self._solve_alone)
         elif cell != NO_CELL:
             self._fill(cell, job)
-            if self._busy < len(self._devices):
+            if self._filling and self._busy < len(self._devices):  # rather than wait for a full bank
                 self._submit(max(self._filling, key=lambda cell: len(self._filling[cell])))
         else:
+            self._began = self._began if self._unsorted else time.monotonic()
             self._unsorted.append((job, sizes))
             if len(self._unsorted) >= SEEN or time.monotonic() - self._began > SEEN_S:
                 self._sort(endless=True)
@@ -189,17 +196,17 @@ class _Many:
 
     def _sort(self, *, endless: bool) -> None:
         """Chooses cells for problems that fit none."""
-        unsorted, self._unsorted, self._began = self._unsorted, [], time.monotonic()
+        unsorted, self._unsorted = self._unsorted, []
         if not unsorted:
             return
-        every, times = [sizes for _, sizes in unsorted], max(1.0, endless * self._expected / len(unsorted))
+        every, times = [sizes for _, sizes in unsorted], max(1.0, endless * self._expected / self._seen)
         cells = choose_cells(every, times)
         members = Counter(cell_for(sizes, cells) for sizes in every)
         cells = [cell for cell in cells if members[cell] * times >= WORTH]
         for job, sizes in unsorted:
             cell = cell_for(sizes, cells)
             if cell == NO_CELL:
-                self._begin(self._solve_alone, job)
+                self._begin([job], self._solve_alone)
             else:
                 self._fill(cell, job)
 
@@ -212,13 +219,13 @@ class _Many:
 
     def _submit(self, cell: Sizes) -> None:
         if bank := self._filling.pop(cell, None):
-            self._begin(self._solve, cell, bank, self._devices[next(self._turn) % len(self._devices)])
+            self._begin(bank, self._solve, cell, self._devices[next(self._turn) % len(self._devices)])
 
-    def _begin(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Work for a thread."""
+    def _begin(self, jobs: Sequence[_Job], work: Callable[..., None], *arguments: Any) -> None:
+        """Work for a thread (`_guarded`)."""
 
         def run() -> None:
-            work(*arguments)
+            _guarded(jobs, work, *arguments)
             with self._lock:
                 self._busy -= 1
 
@@ -226,10 +233,11 @@ class _Many:
             self._busy += 1
         self._pool.submit(run)
 
-    def _solve_alone(self, job: _Job) -> None:
-        job.result.set_result(_alone(self._policy, self._options, job.problem))
+    def _solve_alone(self, jobs: Sequence[_Job]) -> None:
+        for job in jobs:
+            job.result.set_result(_alone(self._policy, self._options, job.problem))
 
-    def _solve(self, cell: Sizes, bank: Sequence[_Job], device: jax.Device) -> None:
+    def _solve(self, bank: Sequence[_Job], cell: Sizes, device: jax.Device) -> None:
         """Solves a bank."""
         groups: dict[Any, list[tuple[Setup, _Job]]] = {}
         with numerics(np.float32 if self._options.dtype == "float32" else np.float64), jax.default_device(device):
@@ -243,44 +251,36 @@ class _Many:
                 groups.setdefault((setup.options, tree, *(x.shape for x in leaves)), []).append((setup, job))
             for key, group in groups.items():
                 if len(group) < len(bank) / 4 and key not in self._programs:  # of unusual shape
-                    for _, job in group:
-                        self._begin(self._solve_alone, job)
+                    self._begin([job for _, job in group], self._solve_alone)
                 else:
-                    self._solve_group(key, device, group)
+                    _guarded([job for _, job in group], self._solve_group, key, device, [one for one, _ in group])
 
-    def _solve_group(self, key: Any, device: jax.Device, group: list[tuple[Setup, _Job]]) -> None:
+    def _solve_group(self, jobs: Sequence[_Job], key: Any, device: jax.Device, setups: Sequence[Setup]) -> None:
         """Solves problems of one shape. A program is compiled by the first thread that needs it; others do what else
         there is."""
         with self._lock:
             one = self._programs.setdefault(key, _Program("quick" if self._options.compilation == "quick" else "full"))
-        if not one.ready.wait(0) and not one.first.acquire(blocking=False):
-            one.ready.wait(0.1)
-            return self._begin(self._again, key, device, group)
-        began, setups = time.perf_counter(), [setup for setup, _ in group]
+        if not one.ready.is_set() and not one.first.acquire(blocking=False):
+            one.ready.wait(COMPILING_S)
+            return self._begin(jobs, self._solve_group, key, device, setups)
+        began = time.perf_counter()
         try:
-            ends = one.run(setups, self._bank, self._options, self._lanes)
-        except Exception as error:
-            for _, job in group:
-                job.result.set_result(error)
-            return None
-        seconds = (time.perf_counter() - began) / len(group)
-        for number, (setup, job) in enumerate(group):
+            with numerics(setups[0].dtype), jax.default_device(device):
+                ends = one.run(setups, self._bank, self._options, self._lanes)
+        finally:
+            one.ready.set()  # if it failed, others try it themselves
+        seconds = (time.perf_counter() - began) / len(setups)
+        for number, (setup, job) in enumerate(zip(setups, jobs, strict=True)):
             job.result.set_result(_solution(setup, jax.tree.map(lambda x, k=number: x[k], ends), seconds))
         return None
-
-    def _again(self, key: Any, device: jax.Device, group: list[tuple[Setup, _Job]]) -> None:
-        with numerics(group[0][0].dtype), jax.default_device(device):
-            self._solve_group(key, device, group)
 
 
 class _Program:
     """The program of problems of one shape."""
 
     def __init__(self, level: Level) -> None:
-        self._function, self._programs = (
-            program(solve_rows, "options", "length", "lanes", level=level),
-            ParallelCompilation(),
-        )
+        self._function = program(solve_rows, "options", "length", "lanes", level=level)
+        self._programs = ParallelCompilation()
         self.first, self.ready = threading.Lock(), threading.Event()
 
     def run(self, setups: Sequence[Setup], size: int, options: SolveOptions, lanes: int) -> Ends:
@@ -291,9 +291,17 @@ class _Program:
         starts = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         limit, used = (np.asarray(n, np.int32) for n in (options.max_iterations, len(setups)))
         given = starts, one.policy, options.tolerances, limit, used, one.options, record_length(int(limit)), lanes
-        ends = jax.tree.map(np.asarray, self._programs.run(self._function, *given))
-        self.ready.set()
-        return ends
+        return jax.tree.map(np.asarray, self._programs.run(self._function, *given))
+
+
+def _guarded(jobs: Sequence[_Job], work: Callable[..., None], *arguments: Any) -> None:
+    """`work(jobs, *arguments)`. If it fails, that is the result of its jobs."""
+    try:
+        work(jobs, *arguments)
+    except Exception as error:
+        for job in jobs:
+            if not job.result.done():
+                job.result.set_result(error)
 
 
 def _sizes(problem: BundleProblem) -> Sizes:

@@ -455,10 +455,16 @@ def garbage(tiny: Path) -> Path:
     return path
 
 
+def empty(tiny: Path) -> Path:
+    path = tiny.parent / "empty"
+    path.mkdir()
+    return path
+
+
 BAD = {
     "missing file": (lambda tiny: [str(tiny) + ".none"], "No such file"),
     "empty name": (lambda tiny: [""], "the name of the problem is empty"),
-    "directory": (lambda tiny: [str(tiny.parent)], "directory"),
+    "empty directory": (lambda tiny: [str(empty(tiny))], "directory"),
     "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
     "unknown policy": (lambda tiny: [str(tiny), "--policy", "cerse"], "unknown damping policy 'cerse'"),

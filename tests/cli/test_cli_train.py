@@ -14,7 +14,8 @@ from safetensors import safe_open
 
 from jaxba.cli.train import run
 from jaxba.damping.policy_file import load_policy
-from jaxba.game import groups, rollout
+from jaxba.game import rollout
+from jaxba.runtime import groups
 from jaxba.training import log, task
 from jaxba.training.config import load
 from jaxba.typing import InputError
@@ -150,7 +151,8 @@ def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
 IN_ANOTHER = """
 import sys
 from jaxba.cli import train
-from jaxba.game import groups, rollout
+from jaxba.game import rollout
+from jaxba.runtime import groups
 from jaxba.training import task
 rollout.LANES, task.BASELINES = groups.GROUP, ("ceres",)
 sys.exit(train.run(sys.argv[1:]))

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli.paper import run
-from jaxba.game import groups, rollout, scene_bank
+from jaxba.game import rollout, scene_bank
 from jaxba.paper.report import CLAIMS
 from jaxba.paper.results import PLAYS
 from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
+from jaxba.runtime import groups
 
 TINY = """
 agents:
