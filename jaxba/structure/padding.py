@@ -130,7 +130,7 @@ def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> 
 
 def padded_parameters(
     problem: BundleProblem, capacity: Capacity
-) -> tuple[Float[np.ndarray, "cameras 9"], Float[np.ndarray, "points 3"]]:
+) -> tuple[Float[np.ndarray, "cameras parameters"], Float[np.ndarray, "points 3"]]:
     """The problem's cameras and points, padded with zeros to the capacity."""
     padded = lambda rows, count: np.pad(np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0)))
     return padded(problem.cameras, capacity.cameras), padded(problem.points, capacity.points)

@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 import jaxba
 from jaxba import Loss, ProblemError, SolveOptions, solve_many
 from jaxba.lm.termination import Tolerances
+from jaxba.problem import geometry
 from jaxba.problem.intrinsics import Lenses
+from jaxba.problem.rigs import Rigs
 from jaxba.runtime.numerics import numerics
 from jaxba.solver import many
 from jaxba.solver.lanes import Starts, solve_rows
@@ -94,10 +96,21 @@ def general() -> dict:
         "shared lens": list(map(shared, scenes)),
         "constants": list(map(held, scenes)),
         "priors": list(map(placed, scenes)),
+        "rigs": list(map(in_pairs, scenes)),
     }
 
 
-@pytest.mark.parametrize("kind", ["shared lens", "constants", "priors"])
+def in_pairs(problem):
+    """The problem with its first two cameras in one frame, where they are."""
+    matrices, shifts = geometry.rotation_matrices(problem.cameras[:, :3]), np.array(problem.cameras[:, 3:6])
+    rotation, translation = np.tile(np.eye(3), (problem.num_cameras, 1, 1)), np.zeros((problem.num_cameras, 3))
+    rotation[1] = matrices[1] @ matrices[0].T
+    translation[1] = shifts[1] - rotation[1] @ shifts[0]
+    frame = np.maximum(np.arange(problem.num_cameras) - 1, 0).astype(np.int32)
+    return problem.replace(rigs=Rigs(frame, rotation, translation))
+
+
+@pytest.mark.parametrize("kind", ["shared lens", "constants", "priors", "rigs"])
 def test_what_a_problem_may_hold_it_may_hold_among_many(small, kind):
     problems, options = general()[kind], replace(QUICK, loss=Loss("huber", 1.0))
     found = list(solve_many(problems, "ceres", options))
