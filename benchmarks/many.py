@@ -1,4 +1,4 @@
-"""Problems a second: thousands of windows of real problems by `jaxba.solve_many`, beside C++ Ceres, one by one, `vmap`.
+"""Problems a second: thousands of windows of real problems by `jaxba.solve_many`, beside C++ Ceres and one by one.
 
     python -m benchmarks.many [--count 10000] [--peers 300]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import os
@@ -15,7 +16,8 @@ from jaxba.cli import common
 from jaxba.cli.output import store
 from jaxba.cli.overwriting import check_apart, problem_files
 from jaxba.damping import DampingPolicy
-from jaxba.io import is_colmap
+from jaxba.datasets.bal.paths import resolve
+from jaxba.io import formats, is_colmap
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
@@ -43,27 +45,31 @@ class Row(NamedTuple):
     initial_cost: float | str = ""  # pixels^2
     final_cost: float | str = ""
     iterations: int | str = ""
-    end: str = ""  # why it ended, or why there is no solution
+    end: str = ""  # why it ended
+    error: str = ""  # why there is no solution
 
     @classmethod
     def of(cls, name: str, result: Result) -> Row:
         """That of a result."""
         if not isinstance(result, Solution):
-            return cls(name, end=f"error: {' '.join(str(result).split())}")
+            return cls(name, error=" ".join(str(result).split()))
         problem = result.problem
         sizes = problem.num_cameras, problem.num_points, problem.num_observations
         return cls(name, *sizes, result.initial_cost, result.final_cost, result.iterations, result.termination.reason)
 
 
 def inputs(problems: Sequence[str]) -> list[str]:
-    """The paths of several problems; of a folder that is no COLMAP model what it holds. Empty for a single problem."""
-    if len(problems) == 1 and not (Path(problems[0]).is_dir() and not is_colmap(problems[0])):
-        return []
-    found: list[str] = []
-    for path in problems:
-        inside = sorted(Path(path).iterdir()) if Path(path).is_dir() and not is_colmap(path) else None
-        found += [path] if inside is None else [str(one) for one in inside if one.is_file() or is_colmap(one)]
-    return found
+    """The paths of several problems; of a folder that is none itself what it holds. Empty for a single problem. Raises
+    UsageError: one is standard input. Raises ProblemError: as `resolve`."""
+    common.require(len(problems) < 2 or "-" not in problems, "- is for one problem")
+    found, folders = list[str](), 0
+    for path in map(resolve, problems):
+        if Path(path).is_dir() and not formats.holds_problem(path):
+            inside, folders = sorted(Path(path).iterdir()), folders + 1
+            found += [str(one) for one in inside if one.is_file() or formats.holds_problem(one)]
+        else:
+            found.append(path)
+    return found if folders or len(problems) > 1 else []
 
 
 def solve_all(
@@ -88,8 +94,8 @@ def solve_all(
     common.prepare_process()
     began, shown, rows = time.monotonic(), -1e9, list[Row]()
     every, end = (PROGRESS_S[0], "") if sys.stderr.isatty() else (PROGRESS_S[1], "\n")
-    results = solve_many(_Problems([path for path, _ in left], read), policy, options)
-    with common.notes_printed(), Interrupt("problem", graceful=True) as interrupt:
+    found = contextlib.closing(solve_many(_Problems([path for path, _ in left], read), policy, options))
+    with common.notes_printed(), Interrupt("problem", graceful=True) as interrupt, found as results:
         for (path, name), result in zip(left, results, strict=False):
             if folder and isinstance(result, Solution):
                 result = _stored(folder / name, result, path)
@@ -98,7 +104,7 @@ def solve_all(
                 _append(folder / COSTS, rows[-1])
             now = time.monotonic()
             if not isinstance(result, Solution):
-                text = rows[-1].end.removeprefix("error: ")
+                text = rows[-1].error
                 common.print_error(text if text.startswith(path) else f"{path}: {text}")
             elif now - shown > every:
                 rate, shown = len(rows) / (now - began), now
@@ -107,8 +113,8 @@ def solve_all(
             if interrupt.requested:
                 break
     print(end="" if end else "\n", file=sys.stderr)
-    failed = sum(row.end.startswith("error: ") for row in rows)
-    solved = [row for row in rows if not row.end.startswith("error: ")]
+    solved = [row for row in rows if not row.error]
+    failed = len(rows) - len(solved)
     total = lambda name: sum(float(getattr(row, name)) for row in solved)
     common.print_line(
         f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
@@ -141,13 +147,23 @@ class _Problems:
 
 
 def _names(paths: Sequence[str]) -> list[str]:
-    """Names of solutions: paths below the folder that all have in common."""
+    """Names of solutions: paths below the folder that all have in common, with .txt if their format is only read."""
     absolute = [os.path.abspath(path) for path in paths]
     common_folder = os.path.commonpath([os.path.dirname(path) for path in absolute])
-    names = [os.path.relpath(path, common_folder) for path in absolute]
+    names = [_written(os.path.relpath(path, common_folder), path) for path in absolute]
     twice = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else ()
     common.require(not twice, f"{next(iter(twice), '')}: named twice")
     return names
+
+
+def _written(name: str, source: str) -> str:
+    """A name, as a BAL file if the format of its ending is only read."""
+    if not is_colmap(source):
+        try:
+            formats.writer(name)
+        except ProblemError:
+            return f"{name}.txt"
+    return name
 
 
 def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], *, resume: bool) -> dict[str, list[str]]:
@@ -161,7 +177,7 @@ def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], *, resume: 
         common.require(resume, f"--output {folder}: holds {COSTS} of an earlier run; --resume goes on with it")
         content = costs.read_bytes()
         whole = content[: content.rfind(b"\n") + 1].decode()
-        rows = {row[0]: row for row in list(csv.reader(whole.splitlines()))[1:] if not row[-1].startswith("error: ")}
+        rows = {row[0]: row for row in list(csv.reader(whole.splitlines()))[1:] if not row[-1]}
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([Row._fields, *rows.values()])
     write_text(costs, text.getvalue())

@@ -329,7 +329,7 @@ def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
     problems = [name for name in (args.problem, *args.more) if name]
-    if args.more or args.resume or (args.problem and os.path.isdir(args.problem)):
+    if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
         from jaxba.cli import several
 
         if paths := several.inputs(problems):

@@ -11,7 +11,7 @@ import itertools
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Generator, Iterable, Sequence, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -66,13 +66,13 @@ def solve_many(
     problems: Iterable[BundleProblem | Exception],
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """Solves any number of problems of any shapes, and gives their results in order, each as soon as it is there.
 
     What a problem of the stream ends with is what `solve` alone gives, to rounding (padding changes the order of sums).
     One that cannot be solved gives the exception that `solve` would raise, and the others go on. The first result comes
-    before any program for many is compiled; a list of fewer than some hundred problems is solved by `solve`. An endless
-    stream runs in constant memory: at most `AHEAD` problems are read before their turn.
+    before any program for many is compiled; problems of sizes that are rare are solved by `solve`. An endless stream
+    runs in constant memory: at most `AHEAD` problems are read before their turn.
 
     Lanes are for the method `lm` with a factorisation, on one device each; with other options every problem is solved
     by `solve`. Problems with lenses, rigs or residuals share a program where they have as many cameras, and as many
@@ -85,8 +85,10 @@ def solve_many(
         options: as for `solve`; they hold for all.
 
     Raises:
-        ValueError: bad options, before the first result.
+        ValueError: bad options, or several processes, before the first result.
     """
+    if jax.distributed.is_initialized():
+        raise ValueError("solve_many is for one process: start others without connecting them, and divide the problems")
     options = checked_options(options)
     if isinstance(policy, str):
         policy, options = resolve_policy(policy, options)
@@ -96,7 +98,7 @@ def solve_many(
 
 def _results(
     problems: Iterable[BundleProblem | Exception], policy: DampingPolicy, options: SolveOptions
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     stream = iter(problems)
     for first in stream:
         yield (result := _alone(policy, options, first))
@@ -117,9 +119,9 @@ def _results(
 
 
 def _alone(policy: DampingPolicy, options: SolveOptions, problem: Any) -> Result:
+    if isinstance(problem, Exception):
+        return problem
     try:
-        if isinstance(problem, Exception):
-            raise problem
         return solve(problem, policy, options)
     except Exception as error:
         return error
@@ -142,7 +144,6 @@ class _Many:
         on_cpu = here[0].platform == "cpu"
         self._devices = here[:1] * process.threads() if on_cpu else here
         self._lanes = 1 if on_cpu else GPU_LANES
-        self._pool, self._busy, self._turn = ThreadPoolExecutor(len(self._devices)), 0, itertools.count()
         self._bank = BANK * self._lanes
         self._unsorted: list[tuple[_Job, Sizes]] = []
         self._began, self._seen, self._cells = time.monotonic(), 0, list[Sizes]()
@@ -150,7 +151,11 @@ class _Many:
         self._programs: dict[Any, _Program] = {}
         self._lock = threading.Lock()
         plain = options.linear_solver in ("auto", "explicit") and not options.step_options(policy).method
-        self._in_lanes = plain and options.max_iterations > 0 and options.devices in (None, 1)
+        one_device = options.devices in (None, 1)
+        self._in_lanes = plain and options.max_iterations > 0 and one_device
+        # two solves on several devices at a time would wait for each other
+        self._pool = ThreadPoolExecutor(len(self._devices) if one_device else 1)
+        self._busy, self._turn = 0, itertools.count()
 
     def add(self, problem: Any) -> Future[Result]:
         """The result that a problem will have; perhaps that it is none."""

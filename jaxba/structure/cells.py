@@ -45,7 +45,7 @@ class Sizes(NamedTuple):
         """Those of a problem as it is laid out."""
         observations = ObservationOrder.of(problem)
         cameras, tracks = observations.num_cameras, observations.tracks
-        pairs, slots = observations.num_pairs + observations.num_repeated_pairs, slots_for(tracks)
+        pairs, slots = observations.num_listed_pairs, slots_for(tracks)
         general = problem.lenses or problem.rigs or problem.residuals
         return cls(cameras, len(tracks), slots, pairs, cameras if general else 0)
 

@@ -59,6 +59,11 @@ class ObservationOrder:
         times = np.diff(np.append(np.flatnonzero(new), len(new)))
         return int(np.sum(times * (times - 1) // 2))
 
+    @property
+    def num_listed_pairs(self) -> int:
+        """Number of pairs as a layout lists them: if a camera sees a point twice, in both orders (covisibility.py)."""
+        return self.num_pairs + self.num_repeated_pairs
+
     @cached_property
     def num_observed_points(self) -> int:
         """Number of points with at least one observation."""

@@ -97,8 +97,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
     if general or cameras > MAX_CAMERAS:
         return None
     needed = slots_for(observations.tracks)
-    # if a camera sees a point twice, the pair is listed in both orders (covisibility.py)
-    pairs = observations.num_pairs + observations.num_repeated_pairs
+    pairs = observations.num_listed_pairs
     if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
         return None
     slots = _eighth_octave(max(MIN_OBSERVATIONS, needed))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxba
+from jaxba.cli import common, several
 from jaxba.cli.several import COSTS
 from jaxba.cli.solve import run
 
@@ -57,6 +58,18 @@ def test_one_that_fails_is_one_line_and_the_others_go_on(problems, tmp_path, cap
     assert "bad.txt" in errors[0]
     assert [bool(row["final_cost"]) for row in rows(output)] == [False, True, True, True]
     assert not (output / "bad.txt").exists()
+
+
+def test_what_is_only_read_is_written_as_a_bal_file_and_a_folder_of_opensfm_is_one_problem(problems, tmp_path):
+    paths = ["a/x.nvm", "a/y.json", "a/z.txt.gz"]
+    assert several._names(paths) == ["x.nvm.txt", "y.json.txt", "z.txt.gz"]
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sfm" / "reconstruction.json").write_text("[]")
+    assert several.inputs([str(tmp_path / "sfm")]) == []
+    assert several.inputs([str(tmp_path / "sfm"), "b.txt"]) == [str(tmp_path / "sfm"), "b.txt"]
+    assert several.inputs([str(problems)]) == sorted(map(str, problems.iterdir()))
+    with pytest.raises(common.UsageError):
+        several.inputs(["-", "b.txt"])
 
 
 def test_a_run_goes_on_where_it_was_also_after_a_line_that_was_cut(problems, tmp_path, capsys):

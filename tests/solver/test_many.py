@@ -46,6 +46,7 @@ def small(monkeypatch):
     monkeypatch.setattr(many, "WORTH", 3)
     monkeypatch.setattr(many, "BANK", 4)
     monkeypatch.setattr(many, "SEEN", 6)
+    monkeypatch.setattr(many, "SEEN_S", np.inf)  # whatever the clock says
 
 
 def assert_as_alone(found, problems, policy, options):
