@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy
@@ -168,7 +167,7 @@ def _transposed(
         rest = np.zeros(len(here.camera_index) - len(kept) + 1, int)  # those that stand for other residuals, and none
         slots = jnp.asarray(np.append(kept, rest)[setup.layout.observation])
         arguments = (setup.layout, slots, here, *_symmetries(counted, setup.layout), inputs, cotangents)
-        found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
+        found, residual = jit(_solve_transposed, once=True, static_argnames="options")(*arguments, options=step)
     if not float(residual) < LARGEST_RESIDUAL:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
     return found
@@ -255,7 +254,6 @@ def _solve_transposed(
         here = replace(here, residuals=tuple(replace(x, rows=replace(x.rows, data=data)) for x, data in own))
         return cost(here, *moved(y, theta), options.loss)
 
-    gradient = jax.grad(objective)
     zero = jnp.zeros((count, unknowns.width)), jnp.zeros_like(state.points)
     # the cotangents in the unknowns
     _, pull = jax.vjp(lambda y: found(y, inputs), zero)
@@ -264,18 +262,54 @@ def _solve_transposed(
     size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
     (whole,) = pull((cotangents[0].T, by_points))
     right, whole = project(whole), size(whole)  # where all of it is along the orbit, what is left is rounding
-    product = lambda y: project(jax.jvp(lambda z: gradient(z, inputs), (zero,), (project(y),))[1])
+
+    def along(y: tuple[Array, Array], theta: SolveInputs, step: tuple[Array, Array]) -> Array:
+        """The slope of the cost along a step. Its gradient by y is H step, and by theta step . dg/dtheta."""
+        return jax.jvp(lambda y: objective(y, theta), (y,), (step,))[1]
+
+    def product(y: tuple[Array, Array]) -> tuple[tuple[Array, Array], SolveInputs]:
+        image, by_theta = jax.grad(along, argnums=(0, 1))(zero, inputs, project(y))
+        return project(image), by_theta
+
     inverse = _gauss_newton(layout, state.cameras, state.points, options)
-    tolerance: Any = TOLERANCE * whole
+    tolerance = TOLERANCE * whole
     preconditioner = lambda y: project(inverse(project(y)))
-    adjoint, _ = cg(product, right, tol=0.0, atol=tolerance, maxiter=MAX_PRODUCTS, M=preconditioner)
-    left = jax.tree.map(lambda a, b: a - b, product(adjoint), right)
+    left, through = _conjugate_gradients(product, right, preconditioner, tolerance, inputs)
     # dL/dtheta = -w . dg/dtheta, and what of the solution is constant passes directly
-    _, transpose = jax.vjp(lambda theta: gradient(zero, theta), inputs)
     direct = jax.vjp(lambda theta: found(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]
-    through = transpose(adjoint)[0]
     total = jax.tree.map(lambda a, b: b - a, through, direct)
-    return total, size(left) / jnp.maximum(whole, jnp.finfo(right[0].dtype).tiny)
+    return total, jnp.sqrt(jnp.sum(left * left)) / jnp.maximum(whole, jnp.finfo(right[0].dtype).tiny)
+
+
+def _conjugate_gradients(
+    product: Callable[[Any], tuple[Any, SolveInputs]],
+    right: Any,
+    inverse: Callable[[Any], Any],
+    tolerance: Array,
+    inputs: SolveInputs,
+) -> tuple[Array, SolveInputs]:
+    """Solves `product(x) = right` to a norm of the residual. Returns the residual, and what else `product` gives of the
+    solution, like `inputs`. `product` and `inverse` stand once in the program, which takes long to compile: the last
+    round of the loop has the solution in the place of a direction."""
+    flat, unravel = ravel_pytree(right)
+
+    def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        x, residual, direction, before, count, *_ = carry
+        scaled = ravel_pytree(inverse(unravel(residual)))[0]
+        along = jnp.sum(residual * scaled)
+        direction = scaled + along / before * direction
+        last = (jnp.sqrt(jnp.sum(residual * residual)) <= tolerance) | (count == MAX_PRODUCTS)
+        image, more = product(unravel(jnp.where(last, x, direction)))
+        image = ravel_pytree(image)[0]
+        step = jnp.where(last, 0.0, along / jnp.sum(direction * image))
+        residual = jnp.where(last, flat - image, residual - step * image)
+        return x + step * direction, residual, direction, along, count + 1, more, last
+
+    zero = jnp.zeros_like(flat)
+    nothing = jax.tree.map(jnp.zeros_like, inputs)
+    start = zero, flat, zero, jnp.full((), jnp.inf), jnp.zeros((), jnp.int32), nothing, jnp.asarray(False)
+    _, residual, *_, more, _ = jax.lax.while_loop(lambda carry: ~carry[-1], body, start)
+    return residual, more
 
 
 def _start_of_constants(layout: Layout, cameras: Array) -> Array:
