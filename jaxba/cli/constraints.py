@@ -89,8 +89,9 @@ def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: boo
     if key == "constant_numbers":
         return hold(problem, numbers=items)
     of_images = key in ("constant_poses", "constant_rotations")
-    wanted: Any = "all" if value == "all" else meant(items, names if of_images else ())
-    if labels is not None and wanted != "all":
+    whole = value == "all" or (of_images and value == "frames")
+    wanted: Any = value if whole else meant(items, names if of_images else ())
+    if labels is not None and not whole:
         other = "point" if key == "constant_points" else "lens"
         wanted = labels.positions("image" if of_images else other, wanted)
     part = key.removeprefix("constant_")

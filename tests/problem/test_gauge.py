@@ -23,6 +23,7 @@ from jaxba import (
     with_position_priors,
     write_colmap,
 )
+from jaxba.cli.constraints import constrained
 from jaxba.problem import geometry
 from jaxba.problem.frames import free_poses, in_frames
 
@@ -231,6 +232,9 @@ def test_position_priors_fix_the_gauge_as_far_as_they_can(tmp_path, measured, ga
 def test_frames_that_are_held_let_sensors_move(tmp_path, held, option):
     folder = model_of(tmp_path / "m", 2)
     problem = hold(read_colmap(folder), **held)
+    (tmp_path / "c.yaml").write_text("".join(f"constant_{part}: {which}\n" for part, which in held.items()))
+    named = constrained(read_colmap(folder), (), None, str(tmp_path / "c.yaml"))
+    np.testing.assert_array_equal(named.constants.poses, problem.constants.poses)
     count, cost = by_colmap(folder, **{option: "poses" not in held})
     assert unknowns(problem) == count
     ends_as(problem, cost)
