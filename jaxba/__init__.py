@@ -44,7 +44,8 @@ from jaxba.model.registration import with_residual
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.camera_models import CAMERA_MODELS, CameraModel, register_camera_model
 from jaxba.problem.constants import Constants
-from jaxba.problem.hold import hold, release, with_gauge
+from jaxba.problem.gauge import with_gauge
+from jaxba.problem.hold import hold, release
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors

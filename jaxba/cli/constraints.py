@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from jaxba.cli.common import UsageError
 from jaxba.cli.constraint_values import meant, parse_items
 from jaxba.cli.measurements import MEASURED, with_measured
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
-from jaxba.problem.hold import Gauge, hold, with_gauge
-from jaxba.problem.labels import part_name
+from jaxba.problem.gauge import Gauge, with_gauge
+from jaxba.problem.hold import hold
 from jaxba.settings.configurations import SettingsError, read_file
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
@@ -50,7 +48,7 @@ def constrained(
         parts: dict[str, Any] = {part: "all" for part in PARTS[:4] if part in constant}
         for part, held in (("frames", "poses"), ("frame-rotations", "rotations")):
             if part in constant:
-                parts.setdefault(held, _with_known_places(problem))
+                parts.setdefault(held, "frames")
         problem = hold(problem, **parts)
     except ValueError as error:
         raise UsageError(f"--constant: {error}") from None
@@ -62,20 +60,6 @@ def constrained(
     for key, value in settings.items():
         problem = _applied(problem, file, key, value, strict)
     return with_gauge(problem, gauge or in_file)
-
-
-def _with_known_places(problem: BundleProblem) -> np.ndarray:
-    """Cameras of every frame that have a constant place in the rig. Raises ValueError: a frame has none."""
-    rigs = problem.rigs
-    if rigs is None or rigs.free is None:
-        return np.ones(problem.num_cameras, bool)
-    known = ~np.asarray(rigs.free)
-    lost = np.setdiff1d(rigs.frame, np.asarray(rigs.frame)[known])
-    if len(lost):
-        first = int(np.flatnonzero(np.asarray(rigs.frame) == lost[0])[0])
-        name = part_name(problem.labels, "image", first)
-        raise ValueError(f"the frame of {name} has no image of a camera with a constant place in its rig")
-    return known
 
 
 def _applied(problem: BundleProblem, file: str | None, key: str, value: Any, strict: bool) -> BundleProblem:
@@ -105,8 +89,9 @@ def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: boo
     if key == "constant_numbers":
         return hold(problem, numbers=items)
     of_images = key in ("constant_poses", "constant_rotations")
-    wanted: Any = "all" if value == "all" else meant(items, names if of_images else ())
-    if labels is not None and wanted != "all":
+    whole = value == "all" or (of_images and value == "frames")
+    wanted: Any = value if whole else meant(items, names if of_images else ())
+    if labels is not None and not whole:
         other = "point" if key == "constant_points" else "lens"
         wanted = labels.positions("image" if of_images else other, wanted)
     part = key.removeprefix("constant_")

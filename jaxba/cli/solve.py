@@ -29,7 +29,8 @@ from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import aside_text, facing_away
-from jaxba.problem.hold import Gauge, hold
+from jaxba.problem.gauge import Gauge
+from jaxba.problem.hold import hold
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import ConjugateGradients, Intrinsics, LinearSolverChoice, Preconditioner, Rotation, Scaling
 from jaxba.runtime.compilation import Compilation

@@ -68,9 +68,9 @@ def out_of_frames(
     assert problem.rigs is not None
     turns = lambda vectors: Rotation.from_rotvec(vectors).as_matrix()
     rigs, extrinsics = problem.rigs, cameras[:, -EXTRINSICS_SIZE:]
-    free = np.zeros(len(cameras), bool) if rigs.free is None else np.asarray(rigs.free)
-    rotation = np.where(free[:, None, None], turns(extrinsics[:, :3]), rigs.rotation)
-    translation = np.where(free[:, None], extrinsics[:, 3:], rigs.translation)
+    free = free_poses(problem)[:, POSE_SIZE:]
+    rotation = np.where(free[:, :1, None], turns(extrinsics[:, :3]), rigs.rotation)
+    translation = np.where(free[:, 3:], extrinsics[:, 3:], rigs.translation)
     poses = poses_in_frames(rotation, translation, turns(cameras[:, :3]), cameras[:, 3:6])
     own = cameras[:, POSE_SIZE:-EXTRINSICS_SIZE]
     return np.hstack([poses, own]), replace(rigs, rotation=rotation, translation=translation)

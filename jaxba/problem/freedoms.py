@@ -32,7 +32,14 @@ it is a square, and this squared is some rounding errors of float64."""
 
 def fixed_freedoms(problem: BundleProblem) -> int:
     """How many of a similarity's seven freedoms constants, rigs and residuals fix, as a solve shifts the problem."""
-    return SIMILARITY - _freedoms(shift(problem, -far_middle(problem)))[0].shape[1]
+    return SIMILARITY - free_steps(problem).shape[2]
+
+
+def free_steps(problem: BundleProblem) -> Float[np.ndarray, "cameras 6 directions"]:
+    """Of every pose, in rigs of that of its frame, the steps (radians, extents of the scene) along the directions of a
+    similarity that are free, as a solve shifts the problem. What is constant, or sees nothing, has zeros."""
+    combinations, steps, *_ = _freedoms(shift(problem, -far_middle(problem)))
+    return steps[:, :POSE_SIZE] @ combinations
 
 
 def free_directions(

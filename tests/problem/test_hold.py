@@ -103,12 +103,23 @@ def test_a_gauge_leaves_the_cost_that_is_found_without_it(gauge):
         covariance(free.problem)
 
 
+def moves(problem: BundleProblem) -> np.ndarray:
+    """Which of all parameters, cameras first, are optimised, of lenses of their own."""
+    if problem.constants is None:
+        return np.ones(problem.cameras.size + problem.points.size, bool)
+    cameras = np.hstack([~problem.constants.poses, np.ones((problem.num_cameras, 3), bool)])
+    return np.concatenate([cameras.ravel(), np.repeat(~problem.constants.points, 3)])
+
+
 @pytest.mark.parametrize(
     ("fixed", "numbers"),
     [
         (lambda p: p, 7),
         (lambda p: hold(p, poses=[3]), 1),
         (lambda p: hold(p, rotations="all"), 4),
+        (lambda p: hold(p, rotations=[1]), 4),
+        (lambda p: hold(p, points=[0]), 4),
+        (lambda p: hold(p, points=[0, 1]), 1),
         (lambda p: hold(p, poses=[0, 3]), 0),
         (lambda p: hold(p, poses="all"), 0),
         (lambda p: hold(p, points=[0, 1, 2]), 0),
@@ -125,6 +136,12 @@ def test_a_gauge_holds_what_constants_and_priors_leave_free(fixed, numbers):
         with pytest.warns(ProblemWarning, match="the gauge two-cameras is not needed"):
             found = with_gauge(problem, "two-cameras")
     assert held(found) - held(problem) == numbers
+    # pixels determine as much of what is left as before, and nothing of it is free
+    _, jacobian = support.linear(support.tiny(), StepOptions(coordinates=Coordinates(rotation="manifold")))
+    columns = [jacobian[:, moves(p)] for p in (problem, found)]
+    ranks = [np.linalg.matrix_rank(x / np.linalg.norm(x, axis=0)) for x in columns]
+    if not problem.residuals:
+        assert ranks[0] == ranks[1] == columns[1].shape[1]
 
 
 WRONG = [5, None, "x", [[0], [1, 2]], [[1, 2]], [None], [float("nan")], [-1], [99], {"a": 1}, object()]

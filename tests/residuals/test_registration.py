@@ -227,7 +227,7 @@ def test_a_gauge_holds_no_scale_that_scale_bars_know():
     tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-14, 1e-14, 1e-14), max_iterations=300)
     ends = [jaxba.solve(p, "ceres", tight).final_cost for p in (problem, jaxba.with_gauge(problem, "two-cameras"))]
     assert ends[1] == pytest.approx(ends[0], rel=1e-8)
-    with pytest.warns(jaxba.ProblemWarning, match="residuals fix 1 of 7 directions of the scene already"):
+    with pytest.warns(jaxba.ProblemWarning, match="1 of 7 directions of the scene are fixed already"):
         jaxba.with_gauge(problem, "three-points")
 
 

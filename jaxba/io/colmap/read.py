@@ -50,7 +50,8 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
     Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera models and numbers;
     as in COLMAP, focal lengths and distortion are optimised, shared by the images of a camera. If all are
     SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points stay, they become BAL's lenses, which are faster.
-    Images of one frame of a rig move together; where cameras are in their rigs is constant.
+    Images of one frame of a rig move together. Where cameras are in their rigs is optimised, but for the reference
+    sensor, and in rigs whose reference sensor sees nothing.
 
     What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
     `strict` refuses a model of which a part would be left out. `refine_principal_point` optimises principal points,
@@ -161,12 +162,10 @@ def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
     places = [place_in_rig(model, frames[image.id], image.camera) for image in images]
     poses = [(1.0, *6 * (0.0,)) if place is None else place for place in places]
     rotation = np.diag(COLMAP_FLIP) @ rotations(poses).as_matrix()
-    # a rig whose reference sensor sees nothing has its frames where the first of its other cameras says
-    rig, known = [frames[image.id].rig for image in images], {}
-    for of_rig, place, image in sorted(zip(rig, places, images, strict=True), key=lambda one: one[2].camera):
-        if place is None or of_rig not in known:
-            known[of_rig] = None if place is None else image.camera
-    free = np.array([p is not None and known[r] != i.camera for r, p, i in zip(rig, places, images, strict=True)])
+    # as in COLMAP, a rig whose reference sensor sees nothing, or is no camera, is rigid
+    rig = np.array([frames[image.id].rig for image in images])
+    reference = np.array([place is None for place in places])
+    free = ~reference & np.isin(rig, rig[reference])
     frame = np.unique(ids, return_inverse=True)[1].astype(np.int32)
     return Rigs(frame, rotation, translations(poses) * COLMAP_FLIP, free if free.any() else None)
 
