@@ -50,6 +50,7 @@ from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
+from jaxba.problem.part import part
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb
 from jaxba.problem.residuals import residual
 from jaxba.problem.rigs import Rigs
@@ -66,7 +67,9 @@ from jaxba.typing import register_pytree
 
 if TYPE_CHECKING:
     from jaxba import residuals
+    from jaxba.io.reconstruction import from_pycolmap
     from jaxba.results.alternation import solve_and_retriangulate
+    from jaxba.results.bundle_adjustment import bundle_adjustment
     from jaxba.results.covariance import Covariance, covariance
     from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
     from jaxba.results.retriangulate import Retriangulation, retriangulate
@@ -81,6 +84,8 @@ __version__ = "0.1.0"
 
 _LATE = {
     "results.alternation": ("solve_and_retriangulate",),
+    "io.reconstruction": ("from_pycolmap",),
+    "results.bundle_adjustment": ("bundle_adjustment",),
     "results.covariance": ("Covariance", "covariance"),
     "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
     "results.retriangulate": ("Retriangulation", "retriangulate"),
@@ -140,10 +145,12 @@ __all__ = [
     "Termination",
     "Tolerances",
     "build_layout",
+    "bundle_adjustment",
     "covariance",
     "differentiable_solve",
     "drop_invalid",
     "example_problem",
+    "from_pycolmap",
     "hold",
     "initial_state",
     "inputs_of",
@@ -153,6 +160,7 @@ __all__ = [
     "make_method",
     "make_policy",
     "normalize",
+    "part",
     "perturb",
     "prepare",
     "random_scene",

@@ -39,8 +39,16 @@ OPTIONS: dict[str, str | dict[str, list[str]]] = {
         "HUBER": ["--loss", "huber"],
     },
     "loss_function_scale": "--loss-scale",
+    "min_track_length": {"0": [], "1": []},
 }
 """Options of COLMAP's bundle adjustment by name: the option of the same meaning, or arguments for each value."""
+
+MACHINE = (
+    *("backend", "use_gpu", "gpu_index", "num_threads", "auto_select_solver_type", "max_linear_solver_iterations"),
+    *("min_num_images_gpu_solver", "min_num_residuals_for_cpu_multi_threading"),
+    *(f"max_num_images_direct_{kind}_{where}_solver" for kind in ("dense", "sparse") for where in ("cpu", "gpu")),
+)
+"""Those that say how and where Ceres solves its linear systems: accepted, and of no effect."""
 
 
 def translated(argv: Sequence[str]) -> list[str]:
@@ -72,12 +80,16 @@ def _arguments(name: str, value: str) -> list[str]:
     if name in PATHS:
         return ["--output" if name == "--output_path" else name, value]
     own = name.rpartition(".")[2]
+    if own in MACHINE:
+        return []
     if own not in OPTIONS:
         raise UsageError(f"{name} is not an option here; of COLMAP's are {', '.join(OPTIONS)}")
     meaning = OPTIONS[own]
     if isinstance(meaning, str):
         return [meaning, value]
     known = {"true": "1", "false": "0"}.get(value.lower(), value.upper())
+    if own == "min_track_length" and known not in meaning:
+        raise UsageError(f"{name}: put part: {{min_track: {value}}} in the file of --constraints")
     if known not in meaning:
         raise UsageError(f"{own} must be {' or '.join(sorted(meaning))}, not {value!r}")
     return meaning[known]

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 from jaxba.cli.common import UsageError
-from jaxba.cli.constraint_values import meant, parse_items
+from jaxba.cli.constraint_values import meant, parse_items, parse_mapping, parse_numbers
 from jaxba.cli.measurements import MEASURED, with_measured
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
 from jaxba.problem.gauge import Gauge, with_gauge
 from jaxba.problem.hold import hold
+from jaxba.problem.part import part
 from jaxba.settings.configurations import SettingsError, read_file
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
@@ -25,9 +26,13 @@ KEYS = {
     "constant_extrinsics": "ids of cameras, whose places in their rigs do not move",
     "constant_numbers": "focal, principal_point, distortion or names such as k2",
     **MEASURED,
+    "part": "images, points, ignored and min_track of jaxba.part",
     "gauge": "free, two-cameras or three-points",
 }
 """Keys of the file, and what they hold."""
+
+OF_PART = {"images": "image", "points": "point", "ignored": "point", "min_track": None}
+"""Keys of `part`, and of what kind the items of their lists are; None for a number."""
 
 
 def constrained(
@@ -57,7 +62,7 @@ def constrained(
         raise UsageError(
             f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {shown(in_file)}"
         )
-    for key, value in settings.items():
+    for key, value in sorted(settings.items(), key=lambda item: item[0] != "part"):  # it says what is seen
         problem = _applied(problem, file, key, value, strict)
     return with_gauge(problem, gauge or in_file)
 
@@ -81,18 +86,28 @@ def _read(file: str) -> dict[str, Any]:
 
 
 def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: bool) -> BundleProblem:
-    labels = problem.labels
-    names = frozenset() if labels is None else frozenset(labels.names)
     if key in MEASURED:
         return with_measured(problem, where, key, value, strict)
-    items = parse_items(value, KEYS[key])
+    if key == "part":
+        given = parse_mapping(value, (), tuple(OF_PART))
+        chosen = {name: _wanted(problem, kind, given[name], name) for name, kind in OF_PART.items() if name in given}
+        return part(problem, **chosen)
     if key == "constant_numbers":
-        return hold(problem, numbers=items)
-    of_images = key in ("constant_poses", "constant_rotations")
-    whole = value == "all" or (of_images and value == "frames")
-    wanted: Any = value if whole else meant(items, names if of_images else ())
-    if labels is not None and not whole:
-        other = "point" if key == "constant_points" else "lens"
-        wanted = labels.positions("image" if of_images else other, wanted)
-    part = key.removeprefix("constant_")
-    return hold(problem, **{"lenses" if part == "cameras" else part: wanted})
+        return hold(problem, numbers=parse_items(value, KEYS[key]))
+    held = {"constant_cameras": "lenses"}.get(key, key.removeprefix("constant_"))
+    kind = {"poses": "image", "rotations": "image", "points": "point"}.get(held, "lens")
+    frames = kind == "image" and value == "frames"
+    return hold(problem, **{held: value if frames else _wanted(problem, kind, value, KEYS[key])})
+
+
+def _wanted(problem: BundleProblem, kind: Any, value: Any, what: str) -> Any:
+    """What of a kind a key means, as functions of problems take it."""
+    if kind is None:
+        return int(parse_numbers(what, value, "a whole number", ()))
+    labels = problem.labels
+    items = (
+        value
+        if value == "all"
+        else meant(parse_items(value, what), labels.names if labels is not None and kind == "image" else ())
+    )
+    return items if labels is None or value == "all" else labels.positions(kind, items)

@@ -57,13 +57,13 @@ def hold(
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
     constants.poses[_images(problem, poses)] = True
     constants.poses[np.ix_(_images(problem, rotations), ROTATION)] = True
-    constants.points[_mask(problem, points, problem.num_points, "point")] = True
+    constants.points[mask_of(problem, points, problem.num_points, "point")] = True
     changed = with_constants(problem, constants)
     own = every_lens(problem)
     free = np.array(own.free)
-    free[_mask(problem, lenses, len(free), "lens")] = False
+    free[mask_of(problem, lenses, len(free), "lens")] = False
     free &= ~number_columns(own, numbers)
-    placed = _mask(problem, extrinsics, len(free), "lens")
+    placed = mask_of(problem, extrinsics, len(free), "lens")
     if problem.rigs is not None and problem.rigs.free is not None:
         moves = np.asarray(problem.rigs.free) & ~placed[np.asarray(own.index)]
         changed = changed.replace(rigs=replace(problem.rigs, free=moves if moves.any() else None))
@@ -96,7 +96,7 @@ def every_lens(problem: BundleProblem) -> Lenses:
 def _images(problem: BundleProblem, which: Poses) -> Bool[np.ndarray, " cameras"]:
     """A mask of images; of `frames` those whose camera has a constant place in its rig."""
     if not isinstance(which, str) or which != "frames":
-        return _mask(problem, which, problem.num_cameras, "image")
+        return mask_of(problem, which, problem.num_cameras, "image")
     rigs = problem.rigs
     if rigs is None or rigs.free is None:
         return np.ones(problem.num_cameras, bool)
@@ -108,7 +108,8 @@ def _images(problem: BundleProblem, which: Poses) -> Bool[np.ndarray, " cameras"
     return known
 
 
-def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[np.ndarray, " n"]:
+def mask_of(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[np.ndarray, " n"]:
+    """Which of `count` images, points or lenses are meant. Raises ValueError as `positions_of`."""
     mask = np.zeros(count, bool)
     if isinstance(which, str) and which != "all":
         raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")

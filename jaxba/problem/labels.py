@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int, Integer
@@ -29,6 +29,11 @@ class Labels(ArrayRecord):
 
     points: Integer[np.ndarray, " points"]
     """Ids of points."""
+
+    def of(self, cameras: Any, points: Any) -> Labels:
+        """Those of some cameras and points."""
+        names = np.array(self.names, object)[cameras].tolist()
+        return replace(self, names=tuple(names), images=self.images[cameras], points=self.points[points])
 
     def positions(self, kind: Part, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of parts by id, of images also by name. Raises ValueError: there is no such part; one line."""

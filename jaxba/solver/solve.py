@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Int
@@ -18,6 +18,7 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, distance_to_end
 from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.part import observed_part
 from jaxba.problem.residuals import PIXELS
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
@@ -25,6 +26,7 @@ from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices, Watch
 from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.progress import shown
 from jaxba.solver.stepwise import Stepwise, iterations_before
@@ -103,6 +105,12 @@ class Solution(ArrayRecord):
         pixels = self.final_cost - sum(others.values()) if self.problem.num_observations else 0.0
         return {PIXELS: pixels, **others}
 
+    def update(self, reconstruction: Any) -> None:
+        """Gives a `pycolmap.Reconstruction` what was found of its problem (`jaxba.from_pycolmap`)."""
+        from jaxba.io.reconstruction import update
+
+        update(reconstruction, self.problem)
+
     def plot(self) -> Picture:
         """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""
         from jaxba.solver.figure import plot_history
@@ -168,7 +176,13 @@ def solve(
         TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`.
     """
     callback, compiling = shown(callback, verbose)
-    return solve_without(None, problem, policy, options, callback=callback, watch=watch, compiling=compiling)
+    hooks = {"callback": callback, "compiling": compiling}
+    check_problem(problem)
+    part = observed_part(problem)
+    whole = functools.partial(part.whole, problem)
+    watched = watch and (lambda record, now: watch(record, lambda: whole(now())))
+    found = solve_without(None, part.problem, policy, options, watch=watched, **hooks)
+    return replace(found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside])
 
 
 def solve_without(

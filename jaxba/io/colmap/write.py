@@ -32,9 +32,9 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     All files are first written to a hidden folder; then each replaces the old one whole. They are binary, or text where
     the other model is and the folder has no binary one. It may be the other's.
 
-    With another model, `like`, the problem is as `read_colmap` made it from that one, with optimised cameras and
-    points. Poses, points and intrinsics of what is in the problem are replaced, and point errors; all else is written
-    as it was read, also what `read_colmap` left out.
+    With another model, `like`, the problem is as `read_colmap` made it from that one, or a `part` of that, with
+    optimised cameras and points. Poses, points and intrinsics of what is in the problem are replaced, and point errors;
+    all else is written as it was read, also what `read_colmap` left out.
 
     Without another model, image, camera and point ids count from 1, and images are called `image0001.jpg` and so on.
     Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and constant.
@@ -48,9 +48,8 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     model, target = read_model(like), display_name(folder)
     bal = problem.lenses is None or problem.lenses.all_bal
     assembled = assemble(model, refine_principal_point=not bal)
-    counts = problem.num_cameras, problem.num_points, problem.num_observations
     old = assembled.problem
-    if counts != (old.num_cameras, old.num_points, old.num_observations):
+    if (problem.num_cameras, problem.num_points) != (old.num_cameras, old.num_points):
         raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(like)}")
     text = model.suffix == ".txt" and not has_parts(folder, ".bin")  # COLMAP ignores text files beside a binary model
     _check_finite(model, assembled, problem, target)
@@ -73,6 +72,8 @@ def _with_points(model: Model, assembled: Assembled, problem: BundleProblem) -> 
     """The model with the points of the problem, and their errors."""
     heads = model.points.copy()
     heads["xyz"][assembled.points] = problem.points
+    names = ("observations", "camera_index", "point_index")  # all of the model, of which some may not have counted
+    problem = problem.replace(**{name: getattr(assembled.problem, name) for name in names})
     with np.errstate(over="ignore", invalid="ignore"):
         difference = geometry.project(problem) - np.asarray(problem.observations)
     heads["error"][assembled.points] = mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
