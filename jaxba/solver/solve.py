@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -254,6 +255,21 @@ def solution_of(
         total_s=total_s,
         capacity=setup.capacity,
         set_aside=setup.away,
+    )
+
+
+def joined(before: Solution, last: Solution) -> Solution:
+    """The solution of two consecutive solves together."""
+    return replace(
+        last,
+        initial_cost=before.initial_cost,
+        iterations=before.iterations + last.iterations,
+        accepted=before.accepted + last.accepted,
+        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
+        setup_s=before.setup_s + last.setup_s,
+        compile_s=before.compile_s + last.compile_s,
+        total_s=before.total_s + last.total_s,
+        quick_iterations=before.quick_iterations + last.quick_iterations,
     )
 
 
