@@ -50,11 +50,9 @@ def constrained(
     except ValueError as error:
         raise UsageError(f"--constant: {error}; or {', '.join(PARTS)}") from None
     try:
-        parts: dict[str, Any] = {part: "all" for part in PARTS[:4] if part in constant}
-        for part, held in (("frames", "poses"), ("frame-rotations", "rotations")):
-            if part in constant:
-                parts.setdefault(held, "frames")
-        problem = hold(problem, **parts)
+        of_frames = {"frames": "poses", "frame-rotations": "rotations"}
+        parts: dict[str, Any] = {of_frames[part]: "frames" for part in PARTS[4:] if part in constant}
+        problem = hold(problem, **(parts | {part: "all" for part in PARTS[:4] if part in constant}))
     except ValueError as error:
         raise UsageError(f"--constant: {error}") from None
     in_file = settings.pop("gauge", "free")

@@ -32,14 +32,7 @@ it is a square, and this squared is some rounding errors of float64."""
 
 def fixed_freedoms(problem: BundleProblem) -> int:
     """How many of a similarity's seven freedoms constants, rigs and residuals fix, as a solve shifts the problem."""
-    return SIMILARITY - free_steps(problem).shape[2]
-
-
-def free_steps(problem: BundleProblem) -> Float[np.ndarray, "cameras 6 directions"]:
-    """Of every pose, in rigs of that of its frame, the steps (radians, extents of the scene) along the directions of a
-    similarity that are free, as a solve shifts the problem. What is constant, or sees nothing, has zeros."""
-    combinations, steps, *_ = _freedoms(shift(problem, -far_middle(problem)))
-    return steps[:, :POSE_SIZE] @ combinations
+    return SIMILARITY - freedoms(shift(problem, -far_middle(problem)))[0].shape[1]
 
 
 def free_directions(
@@ -48,7 +41,7 @@ def free_directions(
     """The directions of a similarity that a problem near the origin leaves free, up to seven, scene units: steps of the
     parameters of cameras as `in_frames` has them, rotations on the manifold, and of points. What does not move, and
     what nothing observes, has zeros."""
-    combinations, steps, points_move, middle, extent = _freedoms(problem)
+    combinations, steps, points_move, middle, extent = freedoms(problem)
     of_poses = np.einsum("nij,jk->kni", steps, combinations)
     of_poses *= np.where(np.arange(of_poses.shape[2]) % POSE_SIZE < 3, 1.0, extent)  # rotation and translation
     lens = np.zeros((*of_poses.shape[:2], problem.cameras.shape[1] - POSE_SIZE))
@@ -57,7 +50,7 @@ def free_directions(
     return np.concatenate([of_poses[:, :, :POSE_SIZE], lens, of_poses[:, :, POSE_SIZE:]], axis=2), of_points
 
 
-def _freedoms(
+def freedoms(
     problem: BundleProblem,
 ) -> tuple[Float[np.ndarray, "7 directions"], np.ndarray, np.ndarray, np.ndarray, float]:
     """An orthonormal basis of the combinations of w, e and s (in this order) that are free; derivatives of poses by the

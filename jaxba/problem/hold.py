@@ -15,15 +15,12 @@ from jaxtyping import Bool, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
-from jaxba.problem.constants import ROTATION, Constants, constants_of
+from jaxba.problem.constants import ROTATION, constants_of
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 from jaxba.problem.labels import part_name
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
-
-Poses = Which | Literal["frames"]
-"""Images, or the frames of all of them, in whose rigs cameras still move; without rigs as `all`."""
 
 GROUPS = ("focal", "principal_point", "distortion")
 """Groups of the numbers of a lens, as COLMAP's options name them."""
@@ -32,8 +29,8 @@ GROUPS = ("focal", "principal_point", "distortion")
 def hold(
     problem: BundleProblem,
     *,
-    poses: Poses = (),
-    rotations: Poses = (),
+    poses: Which | Literal["frames"] = (),
+    rotations: Which | Literal["frames"] = (),
     points: Which = (),
     lenses: Which = (),
     numbers: Iterable[str] = (),
@@ -44,10 +41,9 @@ def hold(
 
     Args:
         problem: any problem.
-        poses: images whose pose is constant: that of their frame, and where their camera is in its rig. `frames`:
-            those of all frames alone (COLMAP's `refine_rig_from_world=False`).
-        rotations: images whose rotation is constant; they still move. `frames` as for poses (COLMAP's
-            `constant_rig_from_world_rotation`).
+        poses: images whose pose is constant; `frames`: of all frames of rigs, in which cameras still move (COLMAP's
+            `refine_rig_from_world=False`).
+        rotations: images whose rotation is constant; they still move. `frames` as for poses.
         points: constant points.
         lenses: constant lenses: positions in `problem.lenses`, or of cameras where every camera has its own.
         numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
@@ -58,7 +54,8 @@ def hold(
     constants.poses[_images(problem, poses)] = True
     constants.poses[np.ix_(_images(problem, rotations), ROTATION)] = True
     constants.points[mask_of(problem, points, problem.num_points, "point")] = True
-    changed = with_constants(problem, constants)
+    anything = constants.poses.any() or constants.points.any()
+    changed = problem.replace(constants=constants if anything else None)
     own = every_lens(problem)
     free = np.array(own.free)
     free[mask_of(problem, lenses, len(free), "lens")] = False
@@ -79,12 +76,6 @@ def release(problem: BundleProblem, *, numbers: Iterable[str]) -> BundleProblem:
     return problem.replace(lenses=replace(own, free=np.asarray(own.free) | number_columns(own, numbers)))
 
 
-def with_constants(problem: BundleProblem, constants: Constants) -> BundleProblem:
-    """The problem with these constants; None if nothing is constant."""
-    anything = constants.poses.any() or constants.points.any()
-    return problem.replace(constants=constants if anything else None)
-
-
 def every_lens(problem: BundleProblem) -> Lenses:
     """The lenses of a problem, also where every camera has its own BAL lens."""
     if problem.lenses is not None:
@@ -93,7 +84,7 @@ def every_lens(problem: BundleProblem) -> Lenses:
     return Lenses(np.arange(count, dtype=np.int32), np.ones((count, LENS_SIZE), bool))
 
 
-def _images(problem: BundleProblem, which: Poses) -> Bool[np.ndarray, " cameras"]:
+def _images(problem: BundleProblem, which: Which | Literal["frames"]) -> Bool[np.ndarray, " cameras"]:
     """A mask of images; of `frames` those whose camera has a constant place in its rig."""
     if not isinstance(which, str) or which != "frames":
         return mask_of(problem, which, problem.num_cameras, "image")
