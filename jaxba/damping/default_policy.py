@@ -48,8 +48,7 @@ def smallest_decades(low: float, dtype: Any) -> float:
     return max(low, math.log10(float(jnp.finfo(dtype).eps)))
 
 
-FIRST_DAMPING = math.log10(Ceres().initial)
-"""log10 of the lambda at which Ceres' rule starts."""
+FIRST_DAMPING = math.log10(Ceres().initial)  # log10 of the lambda at which Ceres' rule starts
 
 
 class Rescue(NamedTuple):

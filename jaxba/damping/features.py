@@ -18,14 +18,9 @@ from jaxba.damping.guard import GuardState, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 
-FLOOR = 1e-9
-"""Smallest relative decrease that a feature distinguishes from zero."""
-
-PAPER_LIMIT = 1000.0
-"""Upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023."""
-
-FEATURE_LIMIT = 2.0
-"""Bound of the absolute value of every scale-free feature."""
+FLOOR = 1e-9  # smallest relative decrease that a feature distinguishes from zero
+PAPER_LIMIT = 1000.0  # upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023
+FEATURE_LIMIT = 2.0  # bound of the absolute value of every scale-free feature
 
 
 # fmt: off

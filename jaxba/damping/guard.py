@@ -32,8 +32,7 @@ curvature above the second. The next lambda must then be ten times smaller, or a
 without having converged. Shortened steps do not count: in a narrow valley (the COLMAP model bulani7) a smaller lambda
 was rejected twice after them, and Ceres' rule took over in iteration 8."""
 
-UNLIMITED = math.log10(LARGEST)
-"""log10 of the largest lambda of any rule: finite, as a state of the game must be."""
+UNLIMITED = math.log10(LARGEST)  # log10 of the largest lambda of any rule: finite, as a state of the game must be
 
 
 class GuardState(NamedTuple):

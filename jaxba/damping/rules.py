@@ -17,11 +17,8 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 from jaxba.typing import register_pytree
 
-LARGEST = 1e32
-"""Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""
-
-SMALLEST = 1e-30
-"""Lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow again."""
+LARGEST = 1e32  # upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32
+SMALLEST = 1e-30  # lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow again
 
 
 def _scalar(value: Any, info: ProblemInfo) -> Array:

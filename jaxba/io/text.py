@@ -14,11 +14,8 @@ from jaxtyping import Int
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
 
-BLOCK_BYTES = 1 << 22
-"""Bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache."""
-
-SHOWN = 40
-"""Characters of a wrong word that a message shows."""
+BLOCK_BYTES = 1 << 22  # bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache
+SHOWN = 40  # characters of a wrong word that a message shows
 
 _SPACE = re.compile(rb"[ \t\n\r\v\f]")
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")

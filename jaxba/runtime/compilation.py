@@ -34,17 +34,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Compilation = Literal["full", "quick", "auto"]
 """`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, full once iterations pay for it."""
 
-Level = Literal["full", "quick"]
-"""How much one program is optimised."""
-
-OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
-"""The option that switches XLA's newer kernel emitters off."""
-
-Kind = Literal["factorization", "iterative"]
-"""How a step solves its linear system."""
-
-COMPILE_EVENTS = "/jax/core/compile/"
-"""Prefix of the durations that JAX reports while it traces, lowers and compiles."""
+Level = Literal["full", "quick"]  # how much one program is optimised
+OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"  # the option that switches XLA's newer kernel emitters off
+Kind = Literal["factorization", "iterative"]  # how a step solves its linear system
+COMPILE_EVENTS = "/jax/core/compile/"  # prefix of the durations that JAX reports while it traces, lowers and compiles
 
 BREAK_EVEN: dict[Kind, int] = {"factorization": 1_200_000, "iterative": 1_000_000}
 """Observations times iterations after which better programs have paid for their compilation, as

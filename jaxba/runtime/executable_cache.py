@@ -35,14 +35,9 @@ from jaxba.runtime.atomic import atomic_write
 
 SUFFIX = ".jaxba-program"
 
-LIMIT = 1 << 30
-"""Bytes that a folder's programs may have; the least recently used are removed first."""
-
-IN_MEMORY = 16
-"""Programs read from disk that a process keeps: a solve has six."""
-
-PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
-"""Settings of JAX that change no program."""
+LIMIT = 1 << 30  # bytes that a folder's programs may have; the least recently used are removed first
+IN_MEMORY = 16  # programs read from disk that a process keeps: a solve has six
+PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")  # settings of JAX that change no program
 
 
 class CachedExecutable(NamedTuple):

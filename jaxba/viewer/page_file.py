@@ -14,8 +14,7 @@ from jaxba.viewer.sources import Shown
 from jaxba.viewer.stage import ASIDE, Stage
 from jaxba.viewer.words import meaning, numbers, sizes, worst_images
 
-PAGE_POINTS, LISTED = 50_000, 5
-"""Most points on a page in a file, and worst images that it names."""
+PAGE_POINTS, LISTED = 50_000, 5  # most points on a page in a file, and worst images that it names
 
 FRAME_S, LEFT = 1.0, 0.4
 """Seconds for which an iteration is shown, and how far the view is moved to the left, where the words are."""

@@ -19,8 +19,7 @@ from jaxba.viewer.sources import Shown
 SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500
 """Most points and cameras on a page. Software rendering draws them at a few frames a second."""
 
-POINT_SIZE = 0.006
-"""Of points; scenes have a size of about one."""
+POINT_SIZE = 0.006  # of points; scenes have a size of about one
 
 ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)
 """Distance between the middles of neighbouring stages, and where the name of one of several stands."""

@@ -13,11 +13,8 @@ from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
 
-LARGEST_INTEGER = 2**53
-"""Whole numbers below it are exact as float64."""
-
-_SHOWN = 40
-"""Characters of a bad value in a message."""
+LARGEST_INTEGER = 2**53  # whole numbers below it are exact as float64
+_SHOWN = 40  # characters of a bad value in a message
 
 
 class Record:

@@ -16,8 +16,7 @@ from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
-VERSION = "sfm_data_version"
-"""Key that only OpenMVG's files have."""
+VERSION = "sfm_data_version"  # key that only OpenMVG's files have
 
 MODELS = {
     "pinhole": (None, 0),
