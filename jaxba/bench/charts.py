@@ -16,29 +16,20 @@ from jaxba.bench.profile import Target
 from jaxba.solver.figure import COLOURS
 from jaxba.solver.record import Record
 
-AXES = ("iterations", "time")
-"""What the charts of a benchmark have on x."""
+AXES = ("iterations", "time")  # what the charts of a benchmark have on x
 
 DASHES = ("solid", "12px,3px", "12px,3px,2px,3px", "3px,2.4px")
 """Line styles, a different one for each next solver, so that curves can be told apart in black and white."""
 
-SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "star", "x")
-"""Markers."""
+SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "star", "x")  # markers
 
 RESERVED = ("classic", "ceres", "learned", "guarded", "bold", "ceres+refine3", "ceres+embedded", "nielsen+embedded")
 """Solvers that have the first styles in every figure, those of the documents included."""
 
-CLIPPING = 1e3
-"""A convergence plot reaches below the lowest tolerance line by this factor."""
-
-LOG_TIME_SPREAD = 20.0
-"""The time axis is logarithmic if the longest solve takes more than this times the shortest."""
-
-LABEL_DISTANCE = 0.06
-"""Fraction of the axis height below which the labels of two dashed lines would overlap."""
-
-LABEL_WIDTH = 100
-"""Pixels of their labels, beside the chart."""
+CLIPPING = 1e3  # a convergence plot reaches below the lowest tolerance line by this factor
+LOG_TIME_SPREAD = 20.0  # the time axis is logarithmic if the longest solve takes more than this times the shortest
+LABEL_DISTANCE = 0.06  # fraction of the axis height below which the labels of two dashed lines would overlap
+LABEL_WIDTH = 100  # pixels of their labels, beside the chart
 
 _ROWS = (
     "<b>%{fullData.name}</b> %{customdata[0]}: cost %{customdata[2]:.7g}, λ %{customdata[3]:.1e}%{customdata[4]}"
@@ -50,8 +41,7 @@ _POINT = "<b>%{fullData.name}</b> %{y:.4g} at %{x:.4g}<extra></extra>"
 Values: TypeAlias = Sequence[Any] | Mapping[str, Sequence[Any]]
 """Numbers of the points of a line, or by what is on x. NaN is a gap."""
 
-Chart: TypeAlias = dict[str, Any]
-"""Title, note, traces, layout, and the x axis of every position of the switch."""
+Chart: TypeAlias = dict[str, Any]  # title, note, traces, layout, and the x axis of every position of the switch
 
 
 class Style(NamedTuple):

@@ -18,11 +18,8 @@ from jaxba.bench.tables import Table
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 """What the page may load: its own text, and pictures that it makes."""
 
-MARKS: dict[str, str] = dict(zip(SYMBOLS, "●■◆▲▼✚★✖", strict=True))
-"""Characters that look like plotly's markers."""
-
-DIGITS = 7
-"""Significant digits of the numbers in a page."""
+MARKS: dict[str, str] = dict(zip(SYMBOLS, "●■◆▲▼✚★✖", strict=True))  # characters that look like plotly's markers
+DIGITS = 7  # significant digits of the numbers in a page
 
 
 class Page:

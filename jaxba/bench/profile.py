@@ -21,14 +21,9 @@ import numpy as np
 from jaxba.game.statistics import Reached
 from jaxba.solver.record import Record
 
-ITERATION_LIMIT = 100
-"""A solve that has not converged within this many iterations is a failure. Source: the paper."""
-
-PAPER_TOLERANCES = (0.1, 0.001)
-"""Values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures."""
-
-RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
-"""Values of epsilon in the target `f <= f*(1 + epsilon)`."""
+ITERATION_LIMIT = 100  # a solve that has not converged within this many iterations is a failure. Source: the paper
+PAPER_TOLERANCES = (0.1, 0.001)  # values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures
+RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)  # values of epsilon in the target `f <= f*(1 + epsilon)`
 
 ZERO_RESIDUAL_FLOOR = 1e-12
 """Costs up to f* plus this times f0 satisfy every relative tolerance, since f* may be rounding error (1e-26)."""
@@ -81,8 +76,7 @@ def cost_targets(tolerance: float) -> tuple[Target, ...]:
     return (*(Target("tau", tau) for tau in taus(tolerance)), *relative)
 
 
-NEVER = Reached(math.inf, math.inf)
-"""The value for a target that is never reached."""
+NEVER = Reached(math.inf, math.inf)  # the value for a target that is never reached
 
 
 def by_problem(records: Iterable[Record]) -> dict[str, list[Record]]:

@@ -15,8 +15,7 @@ from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
-FILES = ("summary.json", "report.html")
-"""What `write_all` writes."""
+FILES = ("summary.json", "report.html")  # what `write_all` writes
 
 
 def write_all(

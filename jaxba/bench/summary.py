@@ -24,8 +24,7 @@ from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
-FORMAT = 2
-"""Version of `summary.json`; it changes when a key changes its meaning."""
+FORMAT = 2  # version of `summary.json`; it changes when a key changes its meaning
 
 
 class Cell(NamedTuple):

@@ -91,8 +91,7 @@ def best_constant_action(
     return tried[min(tried, key=mean)]
 
 
-Runs = list[Trajectories]
-"""Trajectories of one policy on each bank."""
+Runs = list[Trajectories]  # trajectories of one policy on each bank
 
 
 def play_all(

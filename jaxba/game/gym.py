@@ -25,8 +25,7 @@ except ModuleNotFoundError:
     raise ImportError("this needs Gymnasium: pip install jaxba[gym]") from None
 
 
-ID = "jaxba/BundleAdjustment-v0"
-"""Name of the game for `gymnasium.make`, from the import of this module on."""
+ID = "jaxba/BundleAdjustment-v0"  # name of the game for `gymnasium.make`, from the import of this module on
 
 _MADE_BY = "jaxba.training.api:gym_env"
 gymnasium.register(ID, _MADE_BY, vector_entry_point=_MADE_BY.replace("env", "vector_env"))

@@ -26,8 +26,7 @@ from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.solver.iteration import Carry, begin, iterate
 from jaxba.solver.lanes import refill
 
-LANES = 128
-"""Scenes solved at a time."""
+LANES = 128  # scenes solved at a time
 
 
 class Trajectories(NamedTuple):

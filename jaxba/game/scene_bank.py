@@ -33,14 +33,9 @@ from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import for_traces
 from jaxba.typing import InputError
 
-PORTFOLIO = ("ceres", "gtsam", "theseus")
-"""Rules whose lowest cost is the best known one, each with point iterations."""
-
-PORTFOLIO_ITERATIONS = 50
-"""Largest number of linear solves of each rule."""
-
-PORTFOLIO_FTOL = 1e-7
-"""Relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default."""
+PORTFOLIO = ("ceres", "gtsam", "theseus")  # rules whose lowest cost is the best known one, each with point iterations
+PORTFOLIO_ITERATIONS = 50  # largest number of linear solves of each rule
+PORTFOLIO_FTOL = 1e-7  # relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default
 
 MIN_RATIO, MAX_RATIO = 1.01, 1e6
 """Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is between 1.04 and 1.1."""
@@ -48,17 +43,13 @@ MIN_RATIO, MAX_RATIO = 1.01, 1e6
 SMALLEST_COST = 1e-9
 """Smallest best cost per observation of a usable scene, pixels squared: below, rounding errors dominate."""
 
-MIN_OBSERVATIONS = 30
-"""Smallest number of observations of a scene that is solved at all."""
+MIN_OBSERVATIONS = 30  # smallest number of observations of a scene that is solved at all
 
 MAX_ERROR_ANGLE = 0.2
 """Largest RMS error of a solved scene over the focal length; above it points are close to a camera's plane."""
 
-PAPER_ERROR_ANGLE = 1.0
-"""The same for the family `paper`, whose starts are far away."""
-
-EASY_ENOUGH = 40
-"""Iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene."""
+PAPER_ERROR_ANGLE = 1.0  # the same for the family `paper`, whose starts are far away
+EASY_ENOUGH = 40  # iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene
 
 
 class Bank(NamedTuple):
@@ -100,8 +91,7 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     return jax.lax.map(one, scenes, batch_size=256)
 
 
-DRAWN = 64
-"""Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
+DRAWN = 64  # scenes of which `draw` takes the first that is worth solving; 85% of the default class are
 
 
 @for_traces

@@ -14,12 +14,10 @@ from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 FLIP = np.diag(COLMAP_FLIP)
 """From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""
 
-MIN_OBSERVATIONS = 10
-"""Observations that a camera needs: 20 residuals for its 9 parameters."""
+MIN_OBSERVATIONS = 10  # observations that a camera needs: 20 residuals for its 9 parameters
 
 
-Frames = tuple[int, ...]
-"""Frame number of every camera."""
+Frames = tuple[int, ...]  # frame number of every camera
 
 
 def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build) -> BundleProblem:

@@ -7,20 +7,11 @@ from jaxtyping import Float, Int
 
 from jaxba.kitti.opencv import cv2
 
-SIFT_CONTRAST = 0.02
-"""Contrast threshold, half of OpenCV's: asphalt and shadow have little contrast."""
-
-RATIO = 0.8
-"""Largest ratio of the best to the second-best distance. Source: Lowe 2004, section 7.1."""
-
-EPIPOLAR_PIXELS = 1.0
-"""Distance from the epipolar line beyond which a match is an outlier."""
-
-CONFIDENCE = 0.9999
-"""Of the RANSAC for the essential matrix."""
-
-MIN_ESSENTIAL = 8
-"""Fewer matches cannot verify a geometry that five determine."""
+SIFT_CONTRAST = 0.02  # contrast threshold, half of OpenCV's: asphalt and shadow have little contrast
+RATIO = 0.8  # largest ratio of the best to the second-best distance. Source: Lowe 2004, section 7.1
+EPIPOLAR_PIXELS = 1.0  # distance from the epipolar line beyond which a match is an outlier
+CONFIDENCE = 0.9999  # of the RANSAC for the essential matrix
+MIN_ESSENTIAL = 8  # fewer matches cannot verify a geometry that five determine
 
 
 def detect(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:

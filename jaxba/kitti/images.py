@@ -13,11 +13,8 @@ from jaxba.io.files import display_name, reason
 from jaxba.kitti.sequence import Sequence
 from jaxba.problem.bundle_problem import ProblemError
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG file."""
-
-GREY_BITS = 8
-"""Bits per pixel of the images in which key-points are detected."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
+GREY_BITS = 8  # bits per pixel of the images in which key-points are detected
 
 Reader = Callable[[int], np.ndarray]
 """Grey image of a frame by its position in the sequence, shape (height, width), uint8."""

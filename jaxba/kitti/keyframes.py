@@ -17,11 +17,8 @@ from jaxba.problem.geometry import perspective
 PARALLAX = 10.0
 """Median parallax in pixels of a key-frame of `auto`. VINS-Mono (Qin et al. 2018): 10 at focal length 460."""
 
-SHARE = 0.5
-"""... as it does when less than this share of the tracks of the last key-frame is left."""
-
-MIN_SHARED = 20
-"""Tracks that neighbouring key-frames must share, to estimate their relative pose."""
+SHARE = 0.5  # ... as it does when less than this share of the tracks of the last key-frame is left
+MIN_SHARED = 20  # tracks that neighbouring key-frames must share, to estimate their relative pose
 
 
 def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], focal: float) -> float:

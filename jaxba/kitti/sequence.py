@@ -20,8 +20,7 @@ from jaxba.problem.bundle_problem import ProblemError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
-CAMERAS = range(4)
-"""KITTI's cameras: 0 and 1 are grey, 2 and 3 coloured."""
+CAMERAS = range(4)  # KITTI's cameras: 0 and 1 are grey, 2 and 3 coloured
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from jaxba.problem.similarity import Poses
 DEVKIT_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Metres. Source: `lengths` in the development kit's evaluate_odometry.cpp."""
 
-DEVKIT_STEP = 10
-"""Segments start at every tenth pose. Source: `step_size` there."""
+DEVKIT_STEP = 10  # segments start at every tenth pose. Source: `step_size` there
 
 
 class Errors(NamedTuple):

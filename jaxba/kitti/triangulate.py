@@ -12,11 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.geometry import perspective, translations
 
-GAUSS_NEWTON_STEPS = 6
-"""Gauss-Newton steps of a point after the linear solution; three are enough on most tracks."""
-
-SMALLEST = 1e-12
-"""Damping of the linear systems of a point, relative, for rays that are parallel."""
+GAUSS_NEWTON_STEPS = 6  # Gauss-Newton steps of a point after the linear solution; three are enough on most tracks
+SMALLEST = 1e-12  # damping of the linear systems of a point, relative, for rays that are parallel
 
 
 class Views(NamedTuple):

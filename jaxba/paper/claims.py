@@ -15,18 +15,14 @@ from jaxba.paper.results import Row
 
 Status = Literal["reproduced", "partly", "not", "not run"]
 
-RATIO_TOLERANCE = 1.25
-"""A ratio is reproduced if ours is the paper's up to this factor, either way."""
-
-PARTLY_RATIO = 0.9
-"""A ratio is partly reproduced if ours is at most this, a gain of at least a tenth, of another size."""
+RATIO_TOLERANCE = 1.25  # a ratio is reproduced if ours is the paper's up to this factor, either way
+PARTLY_RATIO = 0.9  # a ratio is partly reproduced if ours is at most this, a gain of at least a tenth, of another size
 
 FRACTION_TOLERANCE = 0.05
 """A fraction is reproduced if ours differs from the paper's by at most this. Also the largest deficit in success of a
 method whose iterations or seconds are compared."""
 
-PARTLY_FRACTION_TOLERANCE = 0.15
-"""A fraction is partly reproduced if ours differs from the paper's by at most this."""
+PARTLY_FRACTION_TOLERANCE = 0.15  # a fraction is partly reproduced if ours differs from the paper's by at most this
 
 CRITERION = (
     f"A **ratio** is *reproduced* if ours is the paper's up to a factor of {RATIO_TOLERANCE:g}, larger or smaller, "

@@ -12,8 +12,7 @@ from jaxba import settings
 from jaxba.problem.options import check_count
 from jaxba.settings import SettingsError, configurations
 
-CONFIG = "config.yaml"
-"""Settings of a run, in its folder."""
+CONFIG = "config.yaml"  # settings of a run, in its folder
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,7 @@ class PaperConfig:
             raise ValueError("agents.state_sizes has a size twice")
 
 
-PAPER_STATE = 5
-"""Number of last errors that the paper's agent observes."""
+PAPER_STATE = 5  # number of last errors that the paper's agent observes
 
 
 def load(name: str) -> PaperConfig:

@@ -17,11 +17,8 @@ from jaxba.paper.tables_and_figures.figures import FIGURES
 from jaxba.runtime.atomic import write_text
 from jaxba.settings import to_yaml
 
-CLAIMS = "claims.md"
-"""File of the table of claims alone, in the folder of the run."""
-
-TAU = 0.001
-"""The smaller tolerance of the paper's figures."""
+CLAIMS = "claims.md"  # file of the table of claims alone, in the folder of the run
+TAU = 0.001  # the smaller tolerance of the paper's figures
 
 INTERPRETATIONS = "interpretations.md"
 """Section on the subjects on which the paper's text and its released code are open or contradict each other: what both

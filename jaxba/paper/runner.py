@@ -38,11 +38,8 @@ LIMIT = profile.ITERATION_LIMIT
 ELSEWHERE, CONSTANT = "-elsewhere", "-constant"
 """Endings of the names of agents that are trained on other real problems, and of twins without learning."""
 
-TEST = "test"
-"""Name of the scenes of the tables in records."""
-
-SMALL = "small"
-"""Family of the small random scenes."""
+TEST = "test"  # name of the scenes of the tables in records
+SMALL = "small"  # family of the small random scenes
 
 Built: TypeAlias = tuple[DampingPolicy, SolveOptions]
 

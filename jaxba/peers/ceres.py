@@ -31,8 +31,7 @@ _log = logging.getLogger(__name__)
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
 """Ceres' linear solver of a mode; the iterative one with SCHUR_JACOBI. After it `INNER` means inner iterations."""
 
-FORCING = 0.1
-"""Forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`."""
+FORCING = 0.1  # forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`
 
 ENDS = {
     "Function tolerance": Termination.COST,

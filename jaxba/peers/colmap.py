@@ -26,11 +26,8 @@ except ModuleNotFoundError:
 
 pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # a failed factorisation is only a rejected step
 
-POSE_SIZE, LENS_SIZE = 7, 5
-"""Numbers of parameters of a pose and of a RADIAL camera."""
-
-PRINCIPAL_POINT = (1, 2)
-"""Indices of cx and cy among the parameters of a RADIAL camera."""
+POSE_SIZE, LENS_SIZE = 7, 5  # numbers of parameters of a pose and of a RADIAL camera
+PRINCIPAL_POINT = (1, 2)  # indices of cx and cy among the parameters of a RADIAL camera
 
 SMALLEST_DEPTH = float(np.finfo(np.float64).eps)
 """COLMAP sets the residual of a point to zero if its depth is smaller than this."""

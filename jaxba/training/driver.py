@@ -33,14 +33,9 @@ from jaxba.training.train_loop import LoopState, run_agents, start_agents
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 
-_METADATA = ("chunk", "wall_s", "evaluated", "best")
-"""What a checkpoint holds besides arrays."""
-
-CHANGEABLE = ("chunks", "keep", "checkpoint_every")
-"""Settings that a resumed run may change."""
-
-SCORE = "training/score"
-"""The metric by which policies are chosen: lower is better."""
+_METADATA = ("chunk", "wall_s", "evaluated", "best")  # what a checkpoint holds besides arrays
+CHANGEABLE = ("chunks", "keep", "checkpoint_every")  # settings that a resumed run may change
+SCORE = "training/score"  # the metric by which policies are chosen: lower is better
 
 
 class Best(NamedTuple):

@@ -14,11 +14,8 @@ from jaxba.runtime.atomic import atomic_write
 FILE = "metrics.jsonl"
 BOARD = "tensorboard"
 
-ORDER = ("seed", "chunk", "updates")
-"""Integers by which rows are ordered and drawn: every row has them."""
-
-Row = dict[str, Any]
-"""Metrics of one chunk by name; None if not finite."""
+ORDER = ("seed", "chunk", "updates")  # integers by which rows are ordered and drawn: every row has them
+Row = dict[str, Any]  # metrics of one chunk by name; None if not finite
 
 
 class Log:

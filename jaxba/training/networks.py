@@ -19,8 +19,7 @@ from jaxtyping import Float
 LAST_LAYER = 3e-3
 """Bound of the uniform initial weights of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
 
-LOG_STD_MAX = 2.0
-"""Upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code."""
+LOG_STD_MAX = 2.0  # upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code
 
 LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))
 """Largest float32 below one; tanh in float32 can round to one."""

@@ -8,17 +8,13 @@ from typing import Any
 
 from jaxba.training.log import Row
 
-YARDSTICKS = ("ceres", "ceres+embedded", "constant action")
-"""Baselines beside which held-out scores are printed."""
-
-MOST_ENTROPY = math.log(2)
-"""Nats of a uniform action in (-1, 1)."""
+YARDSTICKS = ("ceres", "ceres+embedded", "constant action")  # baselines beside which held-out scores are printed
+MOST_ENTROPY = math.log(2)  # nats of a uniform action in (-1, 1)
 
 RANDOM = 0.1
 """Nats; a policy of entropy less than this below `MOST_ENTROPY` acts at random: over nine tenths of the range."""
 
-SAME = 0.1
-"""Decades of lambda; a policy with a smaller spread over states does the same in every state."""
+SAME = 0.1  # decades of lambda; a policy with a smaller spread over states does the same in every state
 
 
 def lines(

@@ -17,8 +17,7 @@ from jaxba.solver.options import SolveOptions
 STATE_SIZES = {1: 7.5, 5: 4.0, 10: 4.5, 20: 5.0}
 """Iterations by state size. Source: the paper, table "Acceleration with different state sizes on BAL"."""
 
-AVERAGE = "schedule-of-our-agent"
-"""Name of the schedule that `average_schedule` makes."""
+AVERAGE = "schedule-of-our-agent"  # name of the schedule that `average_schedule` makes
 
 OURS, CLOCK, REDUCTION, REVERSED = (one.name for one in (agents.OURS, agents.CLOCK, agents.REDUCTION, agents.REVERSED))
 

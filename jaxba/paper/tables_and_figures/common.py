@@ -20,11 +20,8 @@ from jaxba.solver.record import Record
 CLASSIC, CERES = "classic", "ceres"
 """Names of the rules with which every table compares: the paper's baseline and Ceres' rule."""
 
-SCENES = Problems("synthetic", ())
-"""Stands for the synthetic scenes, which are played and not solved one by one."""
-
-NOT_YET = "Not run in this folder yet."
-"""Text of the report if there are no results."""
+SCENES = Problems("synthetic", ())  # stands for the synthetic scenes, which are played and not solved one by one
+NOT_YET = "Not run in this folder yet."  # text of the report if there are no results
 
 
 class Line(NamedTuple):

@@ -20,8 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver.record import Record
 
-PAPER_SIZE = 5
-"""Cameras and points of the paper's small problem."""
+PAPER_SIZE = 5  # cameras and points of the paper's small problem
 
 
 def small_scene(size: int, seed: int) -> Source:

@@ -12,11 +12,8 @@ from jaxba.paper.claims import Statement, ratio_claim, success_claim, time_claim
 from jaxba.paper.runner import ELSEWHERE, Runner, method_named
 from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Line, Part, Table, named, ours, with_twin
 
-CERES_ITSELF = "pyceres:sparse"
-"""Ceres under its own rule; needs the extra `ceres`."""
-
-TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"
-"""Names of our agents, trained elsewhere."""
+CERES_ITSELF = "pyceres:sparse"  # Ceres under its own rule; needs the extra `ceres`
+TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"  # names of our agents, trained elsewhere
 
 MSE_DIFFERENCE = 0.003
 """Largest difference of DeepLM's mean squared errors with and without ours. Source: the paper, after BAL's table."""
