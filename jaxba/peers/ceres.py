@@ -1,7 +1,7 @@
 """Solves with Ceres under its own trust-region rule, and what this shares with `driven.py`. Needs the extra `ceres`.
 
 The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function ignores, are counted
-(see `colmap_problem.py`).
+(see `colmap.py`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from jaxtyping import Bool
 
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
-from jaxba.peers.colmap_problem import ColmapProblem
+from jaxba.peers.colmap import SMALLEST_DEPTH, ColmapProblem, pyceres
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solver.diagnosis import explain_start
