@@ -16,29 +16,20 @@ from jaxba.bench.profile import Target
 from jaxba.solver.figure import COLOURS
 from jaxba.solver.record import Record
 
-AXES = ("iterations", "time")
-"""What the charts of a benchmark have on x."""
+AXES = ("iterations", "time")  # what the charts of a benchmark have on x
 
 DASHES = ("solid", "12px,3px", "12px,3px,2px,3px", "3px,2.4px")
 """Line styles, a different one for each next solver, so that curves can be told apart in black and white."""
 
-SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "star", "x")
-"""Markers."""
+SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "star", "x")  # markers
 
 RESERVED = ("classic", "ceres", "learned", "guarded", "bold", "ceres+refine3", "ceres+embedded", "nielsen+embedded")
 """Solvers that have the first styles in every figure, those of the documents included."""
 
-CLIPPING = 1e3
-"""A convergence plot reaches below the lowest tolerance line by this factor."""
-
-LOG_TIME_SPREAD = 20.0
-"""The time axis is logarithmic if the longest solve takes more than this times the shortest."""
-
-LABEL_DISTANCE = 0.06
-"""Fraction of the axis height below which the labels of two dashed lines would overlap."""
-
-LABEL_WIDTH = 100
-"""Pixels of their labels, beside the chart."""
+CLIPPING = 1e3  # a convergence plot reaches below the lowest tolerance line by this factor
+LOG_TIME_SPREAD = 20.0  # the time axis is logarithmic if the longest solve takes more than this times the shortest
+LABEL_DISTANCE = 0.06  # fraction of the axis height below which the labels of two dashed lines would overlap
+LABEL_WIDTH = 100  # pixels of their labels, beside the chart
 
 _ROWS = (
     "<b>%{fullData.name}</b> %{customdata[0]}: cost %{customdata[2]:.7g}, λ %{customdata[3]:.1e}%{customdata[4]}"
@@ -47,11 +38,8 @@ _ROWS = (
 _STEPS = "<b>%{fullData.name}</b> %{y:.3g} % of the problems within %{x:.3g} times<extra></extra>"
 _POINT = "<b>%{fullData.name}</b> %{y:.4g} at %{x:.4g}<extra></extra>"
 
-Values: TypeAlias = Sequence[Any] | Mapping[str, Sequence[Any]]
-"""Numbers of the points of a line, or by what is on x. NaN is a gap."""
-
-Chart: TypeAlias = dict[str, Any]
-"""Title, note, traces, layout, and the x axis of every position of the switch."""
+Values: TypeAlias = Sequence[Any] | Mapping[str, Sequence[Any]]  # of a line's points, or by what is on x; NaN is a gap
+Chart: TypeAlias = dict[str, Any]  # title, note, traces, layout, and the x axis of every position of the switch
 
 
 class Style(NamedTuple):
@@ -73,17 +61,8 @@ def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
 
 
 def line(name: str, x: Values, y: Values, style: Style, *, label: str = "", marked: bool = True, **own: Any) -> Chart:
-    """The trace of a line.
-
-    Args:
-        name: solver or policy whose line it is.
-        x: places of its points.
-        y: their heights.
-        style: of the solver.
-        label: what the line is called, `name` if empty.
-        marked: whether it has markers.
-        own: further keys of the trace.
-    """
+    """The trace of a solver's or policy's line through points, with markers if `marked`. `label` is what it is called,
+    if not by its name; `own` are further keys."""
     marker = {"symbol": style.symbol, "size": 6, "color": style.color, "maxdisplayed": 14}
     how = {"mode": "lines+markers", "marker": marker} if marked else {"mode": "lines"}
     drawn = {"line": {"color": style.color, "dash": style.dash}, "hovertemplate": _POINT, **how, **own}
@@ -115,17 +94,9 @@ def chart(
     note: str = "",
     height: int = 400,
 ) -> Chart:
-    """A chart. Lines get thinner one by one, so that of equal ones all are seen.
-
-    Args:
-        title: above it.
-        traces: its lines.
-        x: the x axis of every position of the switch.
-        y: the y axis.
-        dashed: heights of dashed lines by their label.
-        note: below it.
-        height: pixels.
-    """
+    """A chart of lines, which get thinner one by one, so that of equal ones all are seen. `x` has an axis for every
+    position of the switch, `dashed` the heights of dashed lines by their labels; the note stands below, and the height
+    is in pixels."""
     count = max(len(traces) - 1, 1)
     thick = [
         {**one["line"], "width": one["line"].get("width", 1.5 + 2 * (1 - k / count))} for k, one in enumerate(traces)
@@ -190,18 +161,11 @@ def profile_chart(records: Sequence[Record], target: Target, styles: Mapping[str
 def problem_charts(
     records: Sequence[Record], problem: str, tolerance: float, styles: Mapping[str, Style]
 ) -> list[Chart]:
-    """Accepted cost, distance to the best cost, and lambda on one problem.
+    """Accepted cost, distance to the best cost, and lambda on one problem, by the records of all.
 
     The cost has dashed lines at `f* + tau (f0 - f*)` for the paper's tolerances and the given one; the distance,
     `f - f*` over f* (over f0 for zero-residual problems), at the relative tolerances. Distances far below the lowest
-    line are drawn at the bottom. The repeat of median time is drawn.
-
-    Args:
-        records: of any problems.
-        problem: name of one of them.
-        tolerance: tau of a dashed line.
-        styles: of the solvers.
-    """
+    line are drawn at the bottom. The repeat of median time is drawn."""
     runs = representatives(records, problem)
     ends = [end for end in map(_end, runs.values()) if 0 < end < math.inf]
     log = bool(ends) and max(ends) / min(ends) > LOG_TIME_SPREAD

@@ -21,20 +21,11 @@ import numpy as np
 from jaxba.game.statistics import Reached
 from jaxba.solver.record import Record
 
-ITERATION_LIMIT = 100
-"""A solve that has not converged within this many iterations is a failure. Source: the paper."""
-
-PAPER_TOLERANCES = (0.1, 0.001)
-"""Values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures."""
-
-RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
-"""Values of epsilon in the target `f <= f*(1 + epsilon)`."""
-
-ZERO_RESIDUAL_FLOOR = 1e-12
-"""Costs up to f* plus this times f0 satisfy every relative tolerance, since f* may be rounding error (1e-26)."""
-
-INITIAL_COST_TOLERANCE = 1e-2
-"""Relative difference of initial costs above which two solvers had different starts. Source: rootba."""
+ITERATION_LIMIT = 100  # a solve that has not converged within this many iterations is a failure. Source: the paper
+PAPER_TOLERANCES = (0.1, 0.001)  # values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures
+RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)  # values of epsilon in the target `f <= f*(1 + epsilon)`
+ZERO_RESIDUAL_FLOOR = 1e-12  # costs to f* plus this times f0 are within every tolerance, as f* may be rounding (1e-26)
+INITIAL_COST_TOLERANCE = 1e-2  # relative difference of costs above which two solvers started elsewhere. Source: rootba
 
 COST_DEFINITION_TOLERANCE = 1e-5
 """Relative difference of initial costs above which rounding cannot be the reason. float32 makes about 1e-6; ignoring
@@ -81,8 +72,7 @@ def cost_targets(tolerance: float) -> tuple[Target, ...]:
     return (*(Target("tau", tau) for tau in taus(tolerance)), *relative)
 
 
-NEVER = Reached(math.inf, math.inf)
-"""The value for a target that is never reached."""
+NEVER = Reached(math.inf, math.inf)  # the value for a target that is never reached
 
 
 def by_problem(records: Iterable[Record]) -> dict[str, list[Record]]:
@@ -165,18 +155,14 @@ def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str
     for r in records:
         item = reach(r, target, starts[r.problem], bests[r.problem])
         found.setdefault(r.solver, {}).setdefault(r.problem, []).append(item)
-    return {solver: {name: _median_reach(items) for name, items in row.items()} for solver, row in found.items()}
+    median = lambda items: Reached(*(float(statistics.median(values)) for values in zip(*items, strict=True)))
+    return {solver: {name: median(items) for name, items in row.items()} for solver, row in found.items()}
 
 
 def reached(row: Mapping[str, Reached], names: Sequence[str]) -> Reached:
     """A row of `reach_table` as arrays over problems; a problem that was not run counts as not reached."""
     found = [row.get(name, NEVER) for name in names]
     return Reached(np.array([r.iterations for r in found]), np.array([r.seconds for r in found]))
-
-
-def _median_reach(items: Sequence[Reached]) -> Reached:
-    iterations = statistics.median(item.iterations for item in items)
-    return Reached(float(iterations), float(statistics.median(item.seconds for item in items)))
 
 
 Curve: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]

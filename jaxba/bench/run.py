@@ -33,11 +33,8 @@ from jaxba.solver.record import Record, record_of
 from jaxba.solver.solve import Solution, solve
 from jaxba.typing import InputError
 
-RESULTS = "results.jsonl"
-"""File of the records, one line per run."""
-
-SETTINGS = "settings.json"
-"""File of the settings that all runs in a folder share; other settings are refused there."""
+RESULTS = "results.jsonl"  # file of the records, one line per run
+SETTINGS = "settings.json"  # file of the settings that all runs in a folder share; other settings are refused there
 
 
 @dataclass(frozen=True)

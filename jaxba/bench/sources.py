@@ -15,11 +15,8 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside, without_views_of
 from jaxba.scenes import DEFAULT_SCENES, random_scene, scene_like
 
-SCENE_PREFIX = "scene:"
-"""Prefix of a random scene: `scene:NAME` or `scene:NAME:SEED`."""
-
-_GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)
-"""Folder names that do not identify a COLMAP model."""
+SCENE_PREFIX = "scene:"  # prefix of a random scene: `scene:NAME` or `scene:NAME:SEED`
+_GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)  # folder names that do not identify a COLMAP model
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
-FORMAT = 2
-"""Version of `summary.json`; it changes when a key changes its meaning."""
+FORMAT = 2  # version of `summary.json`; it changes when a key changes its meaning
 
 
 class Cell(NamedTuple):
@@ -49,8 +48,7 @@ class TargetSummary(NamedTuple):
     """Statistics of a solver on one target over all problems, `total`, also those that it was not run on.
 
     Means are geometric: over the reached problems, with a count of 0 taken as 1, NaN if there are none; of
-    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`.
-    """
+    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`."""
 
     reached: int
     total: int

@@ -14,17 +14,13 @@ from jaxba.game.rollout import Trajectories
 from jaxba.solver.figure import COLOURS
 from jaxba.training.log import Row
 
-AXES = ("updates", "seconds")
-"""Positions of the switch: gradient updates of an agent, seconds of training."""
-
-TRAINED = "trained"
-"""Name of the trained policy in charts."""
+AXES = ("updates", "seconds")  # positions of the switch: gradient updates of an agent, seconds of training
+TRAINED = "trained"  # name of the trained policy in charts
 
 HELD_OUT = {"mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
 """Charts of held-out scores: fields of a `Score` and their titles. The log has `mean` as `score`."""
 
-EPISODES = 6
-"""Scenes whose episodes are shown."""
+EPISODES = 6  # scenes whose episodes are shown
 
 LEARNING = {
     "episode/length": "iterations of a training episode",
@@ -39,8 +35,7 @@ LEARNING = {
 }
 """Charts of the log of training and their titles; those that a log does not have are left out."""
 
-RULE = Style(COLOURS[-1], "8px,6px", "circle")
-"""Of Ceres' rule, where it is no yardstick."""
+RULE = Style(COLOURS[-1], "8px,6px", "circle")  # of Ceres' rule, where it is no yardstick
 
 
 def to_html(

@@ -20,15 +20,13 @@ from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
 from jaxba.io import check_output, write_problem
 from jaxba.io.files import sidecar_path, strip_compression
 from jaxba.io.formats import FORMATS, by_ending
-from jaxba.io.frames import poses_of, read_sidecar, write_sidecar
+from jaxba.io.frames import poses_of, read_poses, read_sidecar, write_sidecar
 from jaxba.io.notes import note, note_center
-from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
 from jaxba.kitti.assemble import Frames, windows
-from jaxba.kitti.calibration import calibration_files
+from jaxba.kitti.evaluate import path_length
 from jaxba.kitti.options import Build
-from jaxba.kitti.sequence import read_sequence
-from jaxba.kitti.trajectory_errors import path_length
+from jaxba.kitti.sequence import calibration_files, read_sequence
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text

@@ -10,8 +10,7 @@ from jaxba.problem.options import EMBEDDED, LensStep, Refinement, StepOptions, c
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
 
-LARGEST_ESCALATION = 12.0
-"""Decades; more than the whole range of lambda would have no further effect."""
+LARGEST_ESCALATION = 12.0  # decades; more than the whole range of lambda would have no further effect
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,9 @@ from jaxba.damping.guard import GuardState, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 
-FLOOR = 1e-9
-"""Smallest relative decrease that a feature distinguishes from zero."""
-
-PAPER_LIMIT = 1000.0
-"""Upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023."""
-
-FEATURE_LIMIT = 2.0
-"""Bound of the absolute value of every scale-free feature."""
+FLOOR = 1e-9  # smallest relative decrease that a feature distinguishes from zero
+PAPER_LIMIT = 1000.0  # upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023
+FEATURE_LIMIT = 2.0  # bound of the absolute value of every scale-free feature
 
 
 # fmt: off
@@ -177,8 +172,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
 def duration(step: StepInfo) -> Float[Array, ""]:
     """Duration of an iteration by the game's clock over the mean: one of `DURATIONS`, as it has none of its own.
 
-    Bits of the candidate's cost and of lambda draw it: reward and observation agree, and a solve repeats.
-    """
+    Bits of the candidate's cost and of lambda draw it: reward and observation agree, and a solve repeats."""
     bits = [lax.bitcast_convert_type(x.astype(jnp.float32), jnp.uint32) for x in (step.candidate_cost, step.damping)]
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), bits[0]), bits[1])
     choices = jnp.asarray(DURATIONS, step.cost.dtype)

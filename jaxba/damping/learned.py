@@ -24,8 +24,7 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 class AgentPolicy(ABC):
     """What policies of an agent share: they observe, choose an action, and get the lambda that the guard allows."""
 
-    config: AgentConfig
-    """What is observed, what an action means, and the step that the policy is made for."""
+    config: AgentConfig  # what is observed, what an action means, and the step that the policy is made for
 
     @abstractmethod
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
@@ -58,14 +57,10 @@ class AgentPolicy(ABC):
 class ConstantAction(AgentPolicy):
     """The same action in every iteration: what the guard alone achieves, without a network.
 
-    The best constant action of a game is the baseline that training has to beat.
-    """
+    The best constant action of a game is the baseline that training has to beat."""
 
-    action: tuple[float]
-    """In [-1, 1]."""
-
-    config: AgentConfig = field(metadata={"static": True})
-    """What the action means."""
+    action: tuple[float]  # in [-1, 1]
+    config: AgentConfig = field(metadata={"static": True})  # what the action means
 
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
         """The action, whatever the observation."""
@@ -100,8 +95,7 @@ class Layer(NamedTuple):
 class LearnedPolicy(ArrayRecord, AgentPolicy):
     """The mean action of a trained actor, limited by the guard.
 
-    The weights are traced: another policy of the same shape never recompiles.
-    """
+    The weights are traced: another policy of the same shape never recompiles."""
 
     layers: tuple[Layer, ...]
     """Hidden layers with ReLU, then mean and log standard deviation of the action before its tanh."""

@@ -70,8 +70,7 @@ class DampingPolicy(Protocol):
     one never recompiles, and its class selects the code. Both functions are pure and jittable.
 
     A policy may have a third function: `step_options(base)` gives the `StepOptions` that it was made for, which `solve`
-    uses unless its options say otherwise.
-    """
+    uses unless its options say otherwise."""
 
     @property
     def min_gain(self) -> Any:
@@ -93,8 +92,7 @@ def trained_step(policy: DampingPolicy) -> StepOptions:
     return StepOptions() if made_for is None else made_for(StepOptions())
 
 
-_PARTS = ("min_gain", "init", "propose")
-"""What every policy has (`DampingPolicy`)."""
+_PARTS = ("min_gain", "init", "propose")  # what every policy has (`DampingPolicy`)
 
 
 def check_policy(policy: object) -> None:
@@ -117,5 +115,4 @@ def check_policy(policy: object) -> None:
     _structures[type(policy)] = structure
 
 
-_structures: dict[type, Any] = {}
-"""The last structure of a policy of each class, for `check_policy`."""
+_structures: dict[type, Any] = {}  # the last structure of a policy of each class, for `check_policy`

@@ -18,11 +18,8 @@ from jaxba.runtime.atomic import atomic_write
 from jaxba.settings import read
 from jaxba.typing import InputError
 
-FORMAT = "jaxba-policy-1"
-"""Kind and version of a policy file, in its metadata."""
-
-LARGEST_FILE = 1 << 20
-"""Largest size of a policy file in bytes."""
+FORMAT = "jaxba-policy-1"  # kind and version of a policy file, in its metadata
+LARGEST_FILE = 1 << 20  # largest size of a policy file in bytes
 
 
 def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str] | None = None) -> None:

@@ -22,11 +22,8 @@ from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 from jaxba.typing import InputError
 
-LEARNED, BOLD = "learned", "bold"
-"""The shipped network, for lambda alone, and the guard of agents without a network."""
-
-GUARDED = "guarded"
-"""The default policy of a solve."""
+LEARNED, BOLD = "learned", "bold"  # the shipped network, for lambda alone, and the guard of agents without a network
+GUARDED = "guarded"  # the default policy of a solve
 
 SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
 """File of `learned`, trained with the preset of `jaxba-train` that has its name."""
@@ -51,14 +48,9 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 }
 """Factory and one line of description by name."""
 
-SUFFIX = ".safetensors"
-"""Ending by which a name is the path of a policy file."""
-
-OWN = r".+\.py:\w+"
-"""Pattern of the name of a class in a Python file."""
-
-CONSTANT = "constant"
-"""Prefix of `constant:VALUE`."""
+SUFFIX = ".safetensors"  # ending by which a name is the path of a policy file
+OWN = r".+\.py:\w+"  # pattern of the name of a class in a Python file
+CONSTANT = "constant"  # prefix of `constant:VALUE`
 
 
 def make_policy(name: str) -> DampingPolicy:

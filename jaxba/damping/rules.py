@@ -17,11 +17,8 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 from jaxba.typing import register_pytree
 
-LARGEST = 1e32
-"""Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""
-
-SMALLEST = 1e-30
-"""Lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow again."""
+LARGEST = 1e32  # upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32
+SMALLEST = 1e-30  # lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow again
 
 
 def _scalar(value: Any, info: ProblemInfo) -> Array:
@@ -34,8 +31,7 @@ class Ceres:
     """Ceres' trust-region rule with radius 1 / lambda.
 
     Accepted with gain `rho`: lambda times `clip(1 - (2 rho - 1)^3, 1/3, upper)`; rejected: times 2, 4, 8 ...
-    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section 3.2).
-    """
+    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section 3.2)."""
 
     initial: float = 1e-4
     """First lambda. Source: Ceres initial_trust_region_radius 1e4."""
@@ -62,10 +58,6 @@ class Ceres:
         """Factor on lambda after a step with this gain ratio, or after a rejected one, whose factor is `growth`."""
         return jnp.where(accepted, jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling), growth)
 
-    def growth_after(self, rejections: Int[Array, ""]) -> Float[Array, ""]:
-        """Factor after a number of rejections in a row, at least one."""
-        return self.reject_growth * 2.0 ** (rejections - 1)
-
     def init(self, info: ProblemInfo) -> tuple[Array, Array]:
         """See `DampingPolicy`. The state is the factor after the next rejection."""
         damping = _scalar(self.initial * (1 + self.relative * (info.unit - 1)), info)
@@ -82,8 +74,7 @@ def nielsen() -> Ceres:
     """g2o's rule: as Ceres', but an accepted step always shrinks lambda (factor in [1/3, 2/3]).
 
     Source: g2o optimization_algorithm_levenberg.cpp: first lambda 1e-5 times the largest Hessian diagonal, which
-    under diagonal scaling is 1e-5 itself; any decrease is accepted.
-    """
+    under diagonal scaling is 1e-5 itself; any decrease is accepted."""
     return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=SMALLEST, relative=1.0)
 
 
@@ -131,8 +122,7 @@ class Classic(Geometric):
 
     Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain threshold
     0.4 as in the authors' released code, since the printed text swaps them. A step that lowers the cost is
-    always accepted.
-    """
+    always accepted."""
 
     initial: float = 0.25
     success: float = 0.5
@@ -162,8 +152,7 @@ def theseus() -> Geometric:
 class Schedule:
     """Repeats a list of lambdas whatever happens; a list of one is a constant.
 
-    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors' agent.
-    """
+    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors' agent."""
 
     values: tuple[float, ...] = (1e-15, 1e-15, 0.194, 0.551)
     """Lambdas, in order."""
@@ -184,6 +173,5 @@ class Schedule:
 def gauss_newton() -> Schedule:
     """Next to no damping. The seven gauge freedoms make the undamped system singular, so lambda is 1e-10.
 
-    Under diagonal scaling this changes no direction that the observations determine by more than 1e-10.
-    """
+    Under diagonal scaling this changes no direction that the observations determine by more than 1e-10."""
     return Schedule(values=(1e-10,))

@@ -45,11 +45,8 @@ Reward = Literal["constant", "clock", "reduction", "reversed"]
 RewardFunction = Callable[[StepInfo, Array, Array], Array]
 """Of an iteration, the best known cost of the scene, and whether the episode has ended in success."""
 
-DISTANCE_FLOOR = 1e-6
-"""Relative distance to the best known cost that a critic does not distinguish from zero."""
-
-BONUS_DECAY = 0.01
-"""Fraction of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023."""
+DISTANCE_FLOOR = 1e-6  # relative distance to the best known cost that a critic does not distinguish from zero
+BONUS_DECAY = 0.01  # fraction of the bonus lost in an iteration under `reduction`. Source: Belder et al. 2023
 
 
 @dataclass(frozen=True)
@@ -273,7 +270,7 @@ class Game:
 def _rule_damping(memory: Memory) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
     rule, rejections = Ceres(), memory.guard.rescue.in_a_row
-    factor = rule.factor(rejections == 0, memory.gain, rule.growth_after(rejections))
+    factor = rule.factor(rejections == 0, memory.gain, rule.reject_growth * 2.0 ** (rejections - 1))
     return memory.damping + jnp.where(memory.iteration == 0, 0.0, jnp.log10(factor))
 
 

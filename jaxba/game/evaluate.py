@@ -10,9 +10,8 @@ from jaxtyping import Float
 
 from jaxba.damping import ConstantAction, DampingPolicy
 from jaxba.game.env import GameConfig
-from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.rollout import Trajectories, play
+from jaxba.game.rollout import Trajectories, alike, play
 from jaxba.game.scene_bank import Bank, reach
 from jaxba.game.statistics import capped, geometric_mean
 from jaxba.problem.options import StepOptions
@@ -91,8 +90,7 @@ def best_constant_action(
     return tried[min(tried, key=mean)]
 
 
-Runs = list[Trajectories]
-"""Trajectories of one policy on each bank."""
+Runs = list[Trajectories]  # trajectories of one policy on each bank
 
 
 def play_all(
@@ -108,17 +106,6 @@ def play_all(
     }
 
 
-def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
-    """The virtual best of several policies on a bank: for each scene the lowest cost after each iteration, and the
-    fewest iterations to convergence, each of the policy that has it. Its dampings are those of the first policy."""
-    return Trajectories(
-        costs=np.min([run.costs for run in runs], axis=0),
-        dampings=runs[0].dampings,
-        iterations=np.min([np.where(run.converged, run.iterations, limit) for run in runs], axis=0),
-        converged=np.any([run.converged for run in runs], axis=0),
-    )
-
-
 def best_costs(runs: Mapping[str, Runs], banks: Sequence[Bank]) -> list[np.ndarray]:
     """The lowest cost of each scene in the bank and in all runs."""
     return [
@@ -130,11 +117,15 @@ def best_costs(runs: Mapping[str, Runs], banks: Sequence[Bank]) -> list[np.ndarr
 def scores(
     policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
 ) -> dict[str, Score]:
-    """Scores of all policies and rules, and as `virtual best` that of the best rule for each scene.
+    """Scores of all policies and rules, and as `virtual best` that of the best rule for each scene: the lowest cost
+    after each iteration, and the fewest iterations to convergence, each of the rule that has it.
 
-    The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores.
-    """
+    The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores."""
     runs = {**policies, **rules}
-    best = best_costs(runs, banks)
-    lowest = [virtual_best([run[k] for run in rules.values()], limit) for k in range(len(banks))]
+    best, lowest = best_costs(runs, banks), []
+    for of_bank in zip(*rules.values(), strict=True):
+        length = np.min([np.where(run.converged, run.iterations, limit) for run in of_bank], axis=0)
+        costs = np.min([run.costs for run in of_bank], axis=0)
+        converged = np.any([run.converged for run in of_bank], axis=0)
+        lowest.append(Trajectories(costs, of_bank[0].dampings, length, converged))
     return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

@@ -27,26 +27,13 @@ SceneFamily = Literal["wide", "paper", "windows"]
 """`wide`: all motions, depths, noises and starts below. `paper`: random cameras that all see all random
 points. `windows`: not random, but cut from real problems (game/windows.py)."""
 
-MOTIONS = ("forward", "lateral", "orbit", "photos")
-"""Motions of the cameras of a wide scene, equally often."""
-
-MIN_VIEWS = 5
-"""Cameras with fewer observations are removed: nine unknowns need five observations."""
-
-NOISE = (0.05, 3.0)
-"""Sigma of a measurement in pixels, log-uniform per scene."""
-
-OUTLIERS = (0.4, 1e-3, 0.03)
-"""Fraction of the scenes with wrong matches, and smallest and largest fraction of wrong matches in these scenes."""
-
-OUTLIER_ERROR = (5.0, 100.0)
-"""Largest error of a wrong match in pixels, log-uniform per scene."""
-
-FOCAL = (300.0, 4000.0)
-"""Focal length in pixels, log-uniform per scene."""
-
-CANDIDATES = 3
-"""Points drawn per point that is kept, since many are seen by one camera only."""
+MOTIONS = ("forward", "lateral", "orbit", "photos")  # motions of the cameras of a wide scene, equally often
+MIN_VIEWS = 5  # cameras with fewer observations are removed: nine unknowns need five observations
+NOISE = (0.05, 3.0)  # sigma of a measurement in pixels, log-uniform per scene
+OUTLIERS = (0.4, 1e-3, 0.03)  # fraction of scenes with wrong matches; smallest and largest fraction of these in them
+OUTLIER_ERROR = (5.0, 100.0)  # largest error of a wrong match in pixels, log-uniform per scene
+FOCAL = (300.0, 4000.0)  # focal length in pixels, log-uniform per scene
+CANDIDATES = 3  # points drawn per point that is kept, since many are seen by one camera only
 
 START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.25)
 """Sigmas of the error of the start, log-uniform per scene: rotations in radians, centres in units of the distance of
@@ -295,8 +282,7 @@ def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
     Source: the text of Belder et al. 2023, which draws points and camera poses at random and names no distribution:
     here points in a cube, and cameras in all directions around it that look at a random place in it, with a random
     roll. The noise is that of the paper's equation 1, without which the best cost would be zero and a relative
-    tolerance meaningless. The text does not say either how far off a start is (`PAPER_START`).
-    """
+    tolerance meaningless. The text does not say either how far off a start is (`PAPER_START`)."""
     keys = iter(jax.random.split(key, 10))
     normal = lambda *shape: jax.random.normal(next(keys), shape)
     world = jax.random.uniform(next(keys), (kind.points, 3), minval=-2.0, maxval=2.0)

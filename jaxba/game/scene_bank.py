@@ -19,10 +19,9 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import ProblemInfo, make_policy
-from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
-from jaxba.game.rollout import play
-from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
+from jaxba.game.rollout import alike, play
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.windows import read_windows
 from jaxba.io.files import StrPath
 from jaxba.model.linearize import cost
@@ -33,32 +32,21 @@ from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import for_traces
 from jaxba.typing import InputError
 
-PORTFOLIO = ("ceres", "gtsam", "theseus")
-"""Rules whose lowest cost is the best known one, each with point iterations."""
-
-PORTFOLIO_ITERATIONS = 50
-"""Largest number of linear solves of each rule."""
-
-PORTFOLIO_FTOL = 1e-7
-"""Relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default."""
+PORTFOLIO = ("ceres", "gtsam", "theseus")  # rules whose lowest cost is the best known one, each with point iterations
+PORTFOLIO_ITERATIONS = 50  # largest number of linear solves of each rule
+PORTFOLIO_FTOL = 1e-7  # relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default
 
 MIN_RATIO, MAX_RATIO = 1.01, 1e6
 """Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is between 1.04 and 1.1."""
 
-SMALLEST_COST = 1e-9
-"""Smallest best cost per observation of a usable scene, pixels squared: below, rounding errors dominate."""
-
-MIN_OBSERVATIONS = 30
-"""Smallest number of observations of a scene that is solved at all."""
+SMALLEST_COST = 1e-9  # least best cost per observation of a usable scene, pixels squared: below, rounding dominates
+MIN_OBSERVATIONS = 30  # smallest number of observations of a scene that is solved at all
 
 MAX_ERROR_ANGLE = 0.2
 """Largest RMS error of a solved scene over the focal length; above it points are close to a camera's plane."""
 
-PAPER_ERROR_ANGLE = 1.0
-"""The same for the family `paper`, whose starts are far away."""
-
-EASY_ENOUGH = 40
-"""Iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene."""
+PAPER_ERROR_ANGLE = 1.0  # the same for the family `paper`, whose starts are far away
+EASY_ENOUGH = 40  # iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene
 
 
 class Bank(NamedTuple):
@@ -98,20 +86,6 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
         return cost(with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss())
 
     return jax.lax.map(one, scenes, batch_size=256)
-
-
-DRAWN = 64
-"""Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
-
-
-@for_traces
-def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
-    """A class's random scene of this number and key. Raises ValueError: none of `DRAWN` scenes is worth solving."""
-    scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
-    rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
-    if not len(rows):
-        raise ValueError(f"no scene of {_shape(kind)} is worth solving")
-    return scene_problem(kind, scenes, int(rows[0]))
 
 
 @dataclass(frozen=True)
@@ -235,8 +209,7 @@ def make_banks(
     return splits
 
 
-MORE_CLASSES = 2**30
-"""Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (driver.py)."""
+MORE_CLASSES = 2**30  # offset of the random streams of classes but the first from the agents', from 1 on (driver.py)
 
 HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
 """Fraction of usable scenes held out; more up to a number whose mean says something, at most the last one."""

@@ -21,14 +21,9 @@ from jaxba.io.files import StrPath
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-HELD_OUT = 0.2
-"""Share of a problem's cameras, the last ones in the order of their places, whose windows are held out."""
-
-FEWEST_CAMERAS = 4
-"""Cameras of the smallest window."""
-
-MOVED = 0.5
-"""Share of the windows that begin where random scenes do."""
+HELD_OUT = 0.2  # share of a problem's cameras, the last ones in the order of their places, whose windows are held out
+FEWEST_CAMERAS = 4  # cameras of the smallest window
+MOVED = 0.5  # share of the windows that begin where random scenes do
 
 
 def read_windows(

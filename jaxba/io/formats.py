@@ -72,8 +72,7 @@ OTHER_ENDINGS = (
 )
 """Endings of what is neither read nor written, so that a name with one of them is a mistake."""
 
-_SNIFFED = 1024
-"""Bytes at the beginning of a file that tell its format."""
+_SNIFFED = 1024  # bytes at the beginning of a file that tell its format
 
 _ARCHIVE = "an archive: unpack it and give the problem in it"
 
@@ -88,8 +87,7 @@ _MAGIC = {
 _COLMAP_COMMENTS = re.compile(rb"# (Camera|Image|3D point|Rig|Frame) list|# \w+ calib list")
 """First line of each text file of a COLMAP model."""
 
-_UNPRINTABLE = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]")
-"""Bytes that no text holds."""
+_UNPRINTABLE = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]")  # bytes that no text holds
 
 
 def ending(path: StrPath) -> str:

@@ -22,8 +22,7 @@ _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-LONGEST_LINE = 1 << 24
-"""Bytes at the end of a file that are looked at before it is appended to."""
+LONGEST_LINE = 1 << 24  # bytes at the end of a file that are looked at before it is appended to
 
 _NAMES = {int: "a whole number", str: "a text", bool: "true or false"}
 

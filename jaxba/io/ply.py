@@ -8,11 +8,8 @@ from jaxba.io.files import StrPath, open_output
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import camera_centers
 
-POINT_COLOUR = (192, 192, 192)
-"""Grey, seen on black and on white."""
-
-CAMERA_COLOUR = (0, 255, 0)
-"""Green, as in the PLY files of Ceres' bundle adjuster."""
+POINT_COLOUR = (192, 192, 192)  # grey, seen on black and on white
+CAMERA_COLOUR = (0, 255, 0)  # green, as in the PLY files of Ceres' bundle adjuster
 
 _VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3)])
 

@@ -14,11 +14,8 @@ from jaxtyping import Int
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
 
-BLOCK_BYTES = 1 << 22
-"""Bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache."""
-
-SHOWN = 40
-"""Characters of a wrong word that a message shows."""
+BLOCK_BYTES = 1 << 22  # bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache
+SHOWN = 40  # characters of a wrong word that a message shows
 
 _SPACE = re.compile(rb"[ \t\n\r\v\f]")
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
@@ -65,18 +62,14 @@ def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: s
 class Text:
     """The text of a file: lines one after the other, then the numbers in all that follows.
 
-    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0.
-    """
+    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0."""
 
     def __init__(self, text: bytes, name: str):
         """`text` of the file called `name`, with lines that end in LF."""
         self.name = name
-        self.line = 0
-        """Number of the line that was read last, from 1."""
-        self.values = np.empty(0)
-        """The numbers, up to the first word that is none."""
-        self.field: Callable[[int], str]
-        """What the number at an ordinal is, such as "number of cameras"; may be replaced while reading."""
+        self.line = 0  # number of the line that was read last, from 1
+        self.values = np.empty(0)  # the numbers, up to the first word that is none
+        self.field: Callable[[int], str]  # what the number at an ordinal is; may be replaced while reading
         self._text, self._at = text, 0  # where the next line begins
         self._blocks: list[tuple[int, int]] = []  # of each block the ordinal of its first number, and where it begins
         self._complaint: str | None = None  # about the word after the last number

@@ -11,15 +11,11 @@ from jaxba.kitti.triangulate import Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 
-FLIP = np.diag(COLMAP_FLIP)
-"""From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""
-
-MIN_OBSERVATIONS = 10
-"""Observations that a camera needs: 20 residuals for its 9 parameters."""
+FLIP = np.diag(COLMAP_FLIP)  # from axes x right, y down, z forward (KITTI, COLMAP) to x right, y up, z backward (BAL)
+MIN_OBSERVATIONS = 10  # observations that a camera needs: 20 residuals for its 9 parameters
 
 
-Frames = tuple[int, ...]
-"""Frame number of every camera."""
+Frames = tuple[int, ...]  # frame number of every camera
 
 
 def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build) -> BundleProblem:
@@ -67,13 +63,6 @@ def windows(
     for first in (*range(0, cameras - size, stride), cameras - size):
         keep = (camera_index >= first) & (camera_index < first + size)
         keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
-        names, renumbered = np.unique(point_index[keep], return_inverse=True)
-        part = BundleProblem.create(
-            np.asarray(problem.cameras)[first : first + size],
-            np.asarray(problem.points)[names],
-            np.asarray(problem.observations)[keep],
-            camera_index[keep] - first,
-            renumbered,
-        )
+        part = problem.subset(keep, np.arange(first, first + size), np.unique(point_index[keep]))
         found.append((part, frames[first : first + size]))
     return found

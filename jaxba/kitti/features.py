@@ -7,20 +7,11 @@ from jaxtyping import Float, Int
 
 from jaxba.kitti.opencv import cv2
 
-SIFT_CONTRAST = 0.02
-"""Contrast threshold, half of OpenCV's: asphalt and shadow have little contrast."""
-
-RATIO = 0.8
-"""Largest ratio of the best to the second-best distance. Source: Lowe 2004, section 7.1."""
-
-EPIPOLAR_PIXELS = 1.0
-"""Distance from the epipolar line beyond which a match is an outlier."""
-
-CONFIDENCE = 0.9999
-"""Of the RANSAC for the essential matrix."""
-
-MIN_ESSENTIAL = 8
-"""Fewer matches cannot verify a geometry that five determine."""
+SIFT_CONTRAST = 0.02  # contrast threshold, half of OpenCV's: asphalt and shadow have little contrast
+RATIO = 0.8  # largest ratio of the best to the second-best distance. Source: Lowe 2004, section 7.1
+EPIPOLAR_PIXELS = 1.0  # distance from the epipolar line beyond which a match is an outlier
+CONFIDENCE = 0.9999  # of the RANSAC for the essential matrix
+MIN_ESSENTIAL = 8  # fewer matches cannot verify a geometry that five determine
 
 
 def detect(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
@@ -41,8 +32,7 @@ def detect(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Flo
 def match(first: Float[np.ndarray, "n 128"], second: Float[np.ndarray, "k 128"]) -> Int[np.ndarray, "m 2"]:
     """Descriptors of two images that are mutual nearest neighbours and pass the ratio test in both directions.
 
-    Distances between integers below 2^24 are exact in float32.
-    """
+    Distances between integers below 2^24 are exact in float32."""
     if min(len(first), len(second)) < 2:
         return np.empty((0, 2), np.int64)
     squared = np.maximum((first**2).sum(1)[:, None] + (second**2).sum(1) - 2 * (first @ second.T), 0)
@@ -63,8 +53,7 @@ def essential(
     """Essential matrix of two views by the five-point method and OpenCV's most accurate RANSAC, and which of the rays
     `(X / Z, Y / Z)` are consistent with it: within this distance of the epipolar line, in units of the focal length.
 
-    Source: Nister 2004, "An efficient solution to the five-point relative pose problem"; OpenCV's findEssentialMat.
-    """
+    Source: Nister 2004, "An efficient solution to the five-point relative pose problem"; OpenCV's findEssentialMat."""
     if len(first) < MIN_ESSENTIAL:
         return None, np.zeros(len(first), bool)
     matrix, mask = cv2.findEssentialMat(

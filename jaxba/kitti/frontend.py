@@ -12,16 +12,14 @@ from jaxba.io.notes import report as report_notes
 from jaxba.kitti.assemble import Frames, assemble
 from jaxba.kitti.features import EPIPOLAR_PIXELS, detect, essential, match
 from jaxba.kitti.images import image_reader
-from jaxba.kitti.keyframes import choose
 from jaxba.kitti.odometry import visual_odometry
 from jaxba.kitti.options import Build
 from jaxba.kitti.sequence import Sequence
-from jaxba.kitti.tracks import Tracks, join_matches
+from jaxba.kitti.tracks import Tracks, choose, join_matches
 from jaxba.kitti.triangulate import views_of_poses
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-Report = Callable[[str, int, int], None]
-"""Called with the name of a stage, how much of it is done, and how much there is."""
+Report = Callable[[str, int, int], None]  # called with a stage, how much of it is done, and how much there is
 
 
 def build(
@@ -84,7 +82,13 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         elif not before:
             break
     if len(linked) < 2 or not before:
-        _fail(sequence, options, linked[-1], {k: len(matches[i, k]) for i, k in matches if i == linked[-1]})
+        number, last = sequence.numbers, linked[-1]
+        counts = sorted((k, len(found)) for (i, k), found in matches.items() if i == last)
+        shares = ", ".join(f"{count} with frame {number[k]}" for k, count in counts)
+        raise ProblemError(
+            f"too few matches: frame {number[last]} shares {shares}, at least {options.min_matches} are needed; "
+            f"choose other --frames, more --keypoints or fewer --min-matches"
+        )
     position = {frame: at for at, frame in enumerate(linked)}
     strong = {
         (position[i], position[j]): found
@@ -92,12 +96,3 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         if i in position and j in position and len(found) >= options.min_matches
     }
     return join_matches([pixels[i] for i in linked], strong), tuple(linked)
-
-
-def _fail(sequence: Sequence, options: Build, frame: int, counts: dict[int, int]) -> None:
-    number = sequence.numbers
-    shares = ", ".join(f"{count} with frame {number[j]}" for j, count in sorted(counts.items()))
-    raise ProblemError(
-        f"too few matches: frame {number[frame]} shares {shares}, at least {options.min_matches} are needed; "
-        f"choose other --frames, more --keypoints or fewer --min-matches"
-    )

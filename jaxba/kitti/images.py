@@ -13,14 +13,9 @@ from jaxba.io.files import display_name, reason
 from jaxba.kitti.sequence import Sequence
 from jaxba.problem.bundle_problem import ProblemError
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG file."""
-
-GREY_BITS = 8
-"""Bits per pixel of the images in which key-points are detected."""
-
-Reader = Callable[[int], np.ndarray]
-"""Grey image of a frame by its position in the sequence, shape (height, width), uint8."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
+GREY_BITS = 8  # bits per pixel of the images in which key-points are detected
+Reader = Callable[[int], np.ndarray]  # grey image of a frame by its position, shape (height, width), uint8
 
 
 def image_reader(sequence: Sequence) -> Reader:
@@ -70,8 +65,7 @@ def _decode(path: Path) -> np.ndarray:
 def _is_complete_png(data: bytes) -> bool:
     """Whether the bytes are a complete PNG file, and all its chunks have the right checksums.
 
-    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content.
-    """
+    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content."""
     at = len(PNG_SIGNATURE)
     if data[:at] != PNG_SIGNATURE:
         return False

@@ -15,53 +15,28 @@ import numpy as np
 
 from jaxba.io.frames import Calibration
 from jaxba.kitti.features import EPIPOLAR_PIXELS, essential
-from jaxba.kitti.keyframes import parallax, relative_rotation
 from jaxba.kitti.opencv import cv2
 from jaxba.kitti.options import MIN_MATCHES, Build
-from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.tracks import Tracks, parallax, relative_rotation
 from jaxba.kitti.triangulate import Observations, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
 
-BOOTSTRAP_ANGLE = 2.0
-"""Median angle in degrees between the rays of the first two views that is enough."""
-
-BOOTSTRAP_MOST = 20.0
-"""... and beyond which the essential matrix must be wrong: the points would be nearer than three baselines."""
-
-BOOTSTRAP_ENOUGH = 5.0
-"""Angle beyond which a pair of views is not rated higher."""
-
-BOOTSTRAP_SHARE = 0.5
-"""Share of the common tracks that must fit the motion: a wrong motion fits few of them."""
-
-BOOTSTRAP_LEAST = 0.5
-"""... and the least angle, where no pair has more. Noise of a pixel is 0.1 degrees at KITTI's focal length."""
-
-BOOTSTRAP_REACH = 12
-"""How many views after the first are tried as second ones."""
-
-MIN_POINTS = 15
-"""Inlier points that the pose of a view needs, and that the first two views must give."""
-
-PNP_PIXELS = 3.0
-"""Reprojection error of an outlier."""
+BOOTSTRAP_ANGLE = 2.0  # median angle in degrees between the rays of the first two views that is enough
+BOOTSTRAP_MOST = 20.0  # ... beyond which the essential matrix must be wrong: points nearer than three baselines
+BOOTSTRAP_ENOUGH = 5.0  # angle beyond which a pair of views is not rated higher
+BOOTSTRAP_SHARE = 0.5  # share of the common tracks that must fit the motion: a wrong motion fits few of them
+BOOTSTRAP_LEAST = 0.5  # ... and the least angle, where no pair has more; noise of a pixel is 0.1 degrees on KITTI
+BOOTSTRAP_REACH = 12  # how many views after the first are tried as second ones
+MIN_POINTS = 15  # inlier points that the pose of a view needs, and that the first two views must give
+PNP_PIXELS = 3.0  # reprojection error of an outlier
 
 PNP_ITERATIONS = 300
 
-FARTHEST = 1e9
-"""Largest depth in baselines of points that choose the motion. With OpenCV's 50, a slow drive has none."""
-
-MIN_KNOWN = 3
-"""Known points that the length of a step needs: the median of three tolerates one outlier."""
-
-STILL_PIXELS = 1.0
-"""Median parallax below which a camera stands still: key-points are accurate to less than a pixel."""
-
-MOVED_PIXELS = 3.0
-"""... and from which on it surely moves."""
-
-SPEED_STEPS = 5
-"""Steps whose median length per frame is used where two views share no known points."""
+FARTHEST = 1e9  # largest depth in baselines of points that choose the motion. With OpenCV's 50, a slow drive has none
+MIN_KNOWN = 3  # known points that the length of a step needs: the median of three tolerates one outlier
+STILL_PIXELS = 1.0  # median parallax below which a camera stands still: key-points are accurate to less than a pixel
+MOVED_PIXELS = 3.0  # ... and from which on it surely moves
+SPEED_STEPS = 5  # steps whose median length per frame is used where two views share no known points
 
 
 class _Motion(NamedTuple):
@@ -171,8 +146,7 @@ def visual_odometry(
 def _bootstrap(scene: _Scene, views: int, names: tuple[int, ...]) -> tuple[int, int, _Motion]:
     """The first two views and their motion: the best pair of the first view that has a good one.
 
-    A good pair has many inliers and enough parallax; the best one, by their product, of these or else of all.
-    """
+    A good pair has many inliers and enough parallax; the best one, by their product, of these or else of all."""
     found: list[tuple[bool, float, int, int]] = []
     motions: dict[tuple[int, int], _Motion] = {}
     largest = 0.0

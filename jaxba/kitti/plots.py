@@ -15,8 +15,7 @@ PATH = "#D00000"
 TRUTH = "#7099C8"
 POINT = "#000000"
 
-MARGIN = 30.0
-"""Margin around the true path, metres."""
+MARGIN = 30.0  # margin around the true path, metres
 
 
 def plot_top_view(

@@ -12,11 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.geometry import perspective, translations
 
-GAUSS_NEWTON_STEPS = 6
-"""Gauss-Newton steps of a point after the linear solution; three are enough on most tracks."""
-
-SMALLEST = 1e-12
-"""Damping of the linear systems of a point, relative, for rays that are parallel."""
+GAUSS_NEWTON_STEPS = 6  # Gauss-Newton steps of a point after the linear solution; three are enough on most tracks
+SMALLEST = 1e-12  # damping of the linear systems of a point, relative, for rays that are parallel
 
 
 class Views(NamedTuple):
@@ -118,8 +115,7 @@ def triangulate_robustly(
 
     Points are triangulated once more without the observations whose errors are too large.
 
-    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees apart.
-    """
+    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees apart."""
     first = triangulate(views, observations)
     points, keep = first.points, (first.error <= error) & (first.depth > 0)
     keep &= np.bincount(observations.track[keep], minlength=len(points))[observations.track] >= min_views

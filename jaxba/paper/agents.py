@@ -28,14 +28,9 @@ from jaxba.training import driver, log, task, view
 from jaxba.training.config import TrainConfig
 from jaxba.training.task import Task
 
-POLICY = "policy-{}.safetensors"
-"""File of the trained policy of an agent's training run, by its number from 1."""
-
-SCENES = "scenes"
-"""Folder of the synthetic scenes, which all agents but those for real problems share."""
-
-BASELINES = ("ceres",)
-"""What training logs are compared with; the tables have baselines of their own."""
+POLICY = "policy-{}.safetensors"  # file of the trained policy of an agent's training run, by its number from 1
+SCENES = "scenes"  # folder of the synthetic scenes, which all agents but those for real problems share
+BASELINES = ("ceres",)  # what training logs are compared with; the tables have baselines of their own
 
 
 @dataclass(frozen=True)
@@ -49,17 +44,10 @@ class Agent:
     problems: tuple[str, ...] = ()  # files of real problems, on windows of which it is trained, if any
 
 
-OURS = Agent("agent")
-"""The paper's agent with what it takes to learn; the ablations change one of its settings each."""
-
-PRINTED = Agent("agent-printed", "paper")
-"""The paper's agent with the settings that it prints."""
-
-BEST = Agent("agent-guarded", "default")
-"""The best agent for lambda alone: scale-free observations, and the guard."""
-
-SECONDS = 5.5
-"""Mean duration of an iteration, against a bonus of 10. Source: the paper's table on BAL, 110 s in 20 of classic."""
+OURS = Agent("agent")  # the paper's agent with what it takes to learn; the ablations change one of its settings each
+PRINTED = Agent("agent-printed", "paper")  # the paper's agent with the settings that it prints
+BEST = Agent("agent-guarded", "default")  # the best agent for lambda alone: scale-free observations, and the guard
+SECONDS = 5.5  # mean duration of an iteration, for a bonus of 10. Source: the paper on BAL, 110 s in 20 of classic
 
 BY_THE_CLOCK = ("game.reward=clock", f"game.scale={0.1 * SECONDS}", f"game.bonus={10 / SECONDS}")
 """Minus the duration in seconds, and a bonus of 10, both times the preset's tenth."""

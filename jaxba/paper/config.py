@@ -12,126 +12,75 @@ from jaxba import settings
 from jaxba.problem.options import check_count
 from jaxba.settings import SettingsError, configurations
 
-CONFIG = "config.yaml"
-"""Settings of a run, in its folder."""
+CONFIG = "config.yaml"  # settings of a run, in its folder
 
 
 @dataclass(frozen=True)
 class AgentsConfig:
     """The agents that are trained for the ablation tables."""
 
-    length: float = 1.0
-    """Of every training, relative to that of its preset of `jaxba-train`."""
-
-    overrides: tuple[str, ...] = ()
-    """Changes of the presets of all agents as `key=value`."""
-
-    seeds: int = 3
-    """Training runs of each kind of agent. All of them enter the tables."""
-
-    state_sizes: tuple[int, ...] = (1, 5, 10, 20)
-    """Numbers of last errors that the agents of the state-size table observe. They must include 5, the paper's."""
-
-    trajectories: int = 10
-    """Number of training scenes of the agent that is trained on few. Source: the paper, synthetic data."""
+    length: float = 1.0  # of every training, relative to that of its preset of `jaxba-train`
+    overrides: tuple[str, ...] = ()  # changes of the presets of all agents as `key=value`
+    seeds: int = 3  # training runs of each kind of agent; all of them enter the tables
+    state_sizes: tuple[int, ...] = (1, 5, 10, 20)  # last errors observed, for the state-size table; with 5, the paper's
+    trajectories: int = 10  # training scenes of the agent that is trained on few. Source: the paper, synthetic data
 
 
 @dataclass(frozen=True)
 class ZeroNetConfig:
     """The Zero-net, which the paper calls non-holistic, and its training."""
 
-    width: int = 1280
-    """Units of each layer. Source: the paper."""
-
-    layers: int = 3
-    """Number of hidden layers. Source: the paper."""
-
-    batch: int = 16
-    """Number of scenes in a batch; the gradient is averaged over them."""
-
-    updates: int = 4000
-    """Number of gradient updates; there is one after each step of the batch."""
-
-    max_iterations: int = 30
-    """Iterations after which a scene that has not converged is replaced by another."""
-
-    learning_rate: float = 1e-4
-    """Learning rate of Adam; the paper does not give it."""
+    width: int = 1280  # units of each layer. Source: the paper
+    layers: int = 3  # hidden layers. Source: the paper
+    batch: int = 16  # scenes in a batch; the gradient is averaged over them
+    updates: int = 4000  # gradient updates; there is one after each step of the batch
+    max_iterations: int = 30  # iterations after which a scene that has not converged is replaced by another
+    learning_rate: float = 1e-4  # of Adam; the paper does not give it
 
 
 @dataclass(frozen=True)
 class FamilyConfig:
-    """A family of real problems."""
+    """A family of real problems.
 
-    name: str
-    """Name in tables; the paper's numbers are found by it."""
+    Files are paths, in which $VARIABLES and wildcards are expanded, or names of downloaded BAL problems. Missing ones
+    are left out and listed in the report."""
 
+    name: str  # in tables; the paper's numbers are found by it
     files: tuple[str, ...]
-    """Paths, in which $VARIABLES and wildcards are expanded, or names of downloaded BAL problems. Missing ones are left
-    out and listed in the report."""
-
-    cameras: tuple[int, ...] = ()
-    """Numbers of cameras of the sub-problems that are made of each file."""
-
-    whole: bool = True
-    """Whether the complete problems are used too."""
+    cameras: tuple[int, ...] = ()  # numbers of cameras of the sub-problems that are made of each file
+    whole: bool = True  # whether the complete problems are used too
 
 
 @dataclass(frozen=True)
 class RealConfig:
     """Real problems."""
 
-    bal: tuple[FamilyConfig, ...] = ()
-    """Families of the BAL data set."""
-
-    kitti: FamilyConfig = field(default_factory=lambda: FamilyConfig("KITTI", ()))
-    """KITTI sequences, such as those that `jaxba-kitti` writes, and sub-problems of them."""
-
-    repeats: int = 1
-    """Solves of each problem with each solver; times are medians."""
+    bal: tuple[FamilyConfig, ...] = ()  # families of the BAL data set
+    kitti: FamilyConfig = field(default_factory=lambda: FamilyConfig("KITTI", ()))  # such as `jaxba-kitti` writes
+    repeats: int = 1  # solves of each problem with each solver; times are medians
 
 
 @dataclass(frozen=True)
 class FigureConfig:
     """Problems in the figures."""
 
-    scene: str = "scene:ladybug-49"
-    """Scene of the lambda chart and of the small convergence plot if there are no real problems."""
-
-    large_scene: str = "scene:ladybug-1197"
-    """Scene of the large convergence plot, instead of the problem Ladybug-1197."""
-
-    large_iterations: int = 100
-    """Limit of linear solves on the large scene."""
-
-    profile_scenes: int = 6
-    """Number of random scenes in the performance profiles, in addition to the BAL problems."""
+    scene: str = "scene:ladybug-49"  # of the lambda chart and the small convergence plot, without real problems
+    large_scene: str = "scene:ladybug-1197"  # of the large convergence plot, instead of the problem Ladybug-1197
+    large_iterations: int = 100  # limit of linear solves on the large scene
+    profile_scenes: int = 6  # random scenes in the performance profiles, in addition to the BAL problems
 
 
 @dataclass(frozen=True)
 class PaperConfig:
     """Configuration of a reproduction run."""
 
-    seed: int = 0
-    """Seed of the scenes and agents."""
-
+    seed: int = 0  # of the scenes and agents
     agents: AgentsConfig = field(default_factory=AgentsConfig)
-    """Trained agents."""
-
     zero_net: ZeroNetConfig = field(default_factory=ZeroNetConfig)
-    """The non-holistic network."""
-
     real: RealConfig = field(default_factory=RealConfig)
-    """Real problems."""
-
     figures: FigureConfig = field(default_factory=FigureConfig)
-    """Problems of the figures."""
-
-    small: tuple[int, ...] = (5, 8)
-    """Sizes of the scenes in the table of small problems: the number of cameras and also of points."""
-
-    small_scenes: int = 30
-    """Number of scenes of each size."""
+    small: tuple[int, ...] = (5, 8)  # cameras, and also points, of scenes in the table of small problems
+    small_scenes: int = 30  # scenes of each size
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:
@@ -150,8 +99,7 @@ class PaperConfig:
             raise ValueError("agents.state_sizes has a size twice")
 
 
-PAPER_STATE = 5
-"""Number of last errors that the paper's agent observes."""
+PAPER_STATE = 5  # number of last errors that the paper's agent observes
 
 
 def load(name: str) -> PaperConfig:

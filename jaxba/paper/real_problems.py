@@ -14,8 +14,7 @@ from jaxba.paper.config import FamilyConfig, RealConfig
 from jaxba.paper.subproblem import neighbourhood
 from jaxba.problem.bundle_problem import ProblemError
 
-DATA_VARIABLE = "JAXBA_DATA"
-"""Environment variable with the folder of real problems."""
+DATA_VARIABLE = "JAXBA_DATA"  # environment variable with the folder of real problems
 
 NOT_SET = f"not run: {DATA_VARIABLE} is not set"
 

@@ -25,8 +25,7 @@ T = TypeVar("T")
 
 SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
 
-NEAR = 1e-3
-"""Relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost."""
+NEAR = 1e-3  # relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost
 
 GOOD_END = 1e-2
 """Relative tolerance of `Row.good_ends`: the final cost is within this of the best known cost. A solver that converges
@@ -163,8 +162,7 @@ def _outcome(iterations: int, converged: bool, near: float, end: float, seconds:
     return Outcome(float(iterations) if good else limit, good, min(max(near, 1.0), limit), end, seconds)
 
 
-SCHEDULE = 4
-"""Values of a constant schedule. Source: the paper's schedule [1e-15, 1e-15, 0.194, 0.551]."""
+SCHEDULE = 4  # values of a constant schedule. Source: the paper's schedule [1e-15, 1e-15, 0.194, 0.551]
 
 
 def average_schedule(series: Sequence[Sequence[float]], length: int = SCHEDULE) -> tuple[float, ...]:

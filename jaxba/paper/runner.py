@@ -35,41 +35,27 @@ from jaxba.typing import InputError
 
 LIMIT = profile.ITERATION_LIMIT
 
-ELSEWHERE, CONSTANT = "-elsewhere", "-constant"
-"""Endings of the names of agents that are trained on other real problems, and of twins without learning."""
-
-TEST = "test"
-"""Name of the scenes of the tables in records."""
-
-SMALL = "small"
-"""Family of the small random scenes."""
+ELSEWHERE, CONSTANT = "-elsewhere", "-constant"  # agents trained on other real problems, and untrained twins
+TEST = "test"  # name of the scenes of the tables in records
+SMALL = "small"  # family of the small random scenes
 
 Built: TypeAlias = tuple[DampingPolicy, SolveOptions]
 
 
 @dataclass(frozen=True)
 class Method:
-    """The solver of a table row: a policy, perhaps with several training runs, and the options of the step."""
+    """The solver of a table row: a policy, perhaps with several training runs, and the options of the step.
 
-    name: str
-    """Name in records."""
+    `build` and `driver` get the number of a training run, and a real problem (None: the scenes of the tables); they
+    return None if there is no policy for it. Rules ignore both. They may train it, so they are called only if something
+    has to be run. A policy has collapsed if it does the same in every state in the end."""
 
-    build: Callable[[int, Source | None], Built | None]
-    """Policy and options of a training run, by its number, for a real problem or else the scenes of the tables; None
-    if there is none for this problem. Rules ignore both. This may train the policy, so it is called only if something
-    has to be run."""
-
-    seeds: int = 0
-    """Number of training runs; 0 for a rule."""
-
-    peer: SolverName | None = None
-    """Another library that solves real problems, in place of `build`."""
-
-    driver: Callable[[int, Source], Path | None] | None = None
-    """File of the policy of a training run that drives the other library; without one it has its own rule."""
-
-    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False
-    """Whether most of the training runs for these problems ended with a policy that does the same in every state."""
+    name: str  # in records
+    build: Callable[[int, Source | None], Built | None]  # policy and options of a training run
+    seeds: int = 0  # number of training runs; 0 for a rule
+    peer: SolverName | None = None  # another library that solves real problems, in place of `build`
+    driver: Callable[[int, Source], Path | None] | None = None  # file of the policy that drives it; None: its own rule
+    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False  # whether most policies do so
 
     @property
     def numbers(self) -> range:
@@ -101,8 +87,7 @@ class Runner:
         something starts. Raises ProblemError: a file of results is damaged."""
         self.config, self.folder, self.report = config, folder, report
         self.store = Store(folder)
-        self.done = 0
-        """Number of solves, plays and trainings that this process has done."""
+        self.done = 0  # solves, plays and trainings of this process
         self._read: tuple[Source, BundleProblem] | None = None
 
     def agent(

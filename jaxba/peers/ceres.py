@@ -1,7 +1,7 @@
 """Solves with Ceres under its own trust-region rule, and what this shares with `driven.py`. Needs the extra `ceres`.
 
 The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function ignores, are counted
-(see `colmap_problem.py`).
+(see `colmap.py`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from jaxtyping import Bool
 
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
-from jaxba.peers.colmap_problem import ColmapProblem
+from jaxba.peers.colmap import SMALLEST_DEPTH, ColmapProblem, pyceres
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solver.diagnosis import explain_start
@@ -31,8 +30,7 @@ _log = logging.getLogger(__name__)
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
 """Ceres' linear solver of a mode; the iterative one with SCHUR_JACOBI. After it `INNER` means inner iterations."""
 
-FORCING = 0.1
-"""Forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`."""
+FORCING = 0.1  # forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`
 
 ENDS = {
     "Function tolerance": Termination.COST,
@@ -138,16 +136,9 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
 
 
 def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str, **known: Any) -> StepInfo:
-    """Converts an iteration summary of Ceres into a `StepInfo`.
-
-    Args:
-        now: summary of the iteration.
-        before: summary of the iteration before it, which has the gradient at the start of the step.
-        previous_cost: last accepted cost; the summary of a rejected step has the candidate's cost only.
-        damping: lambda that the step used.
-        mode: mode of the linear solver; only the iterative one counts conjugate gradient iterations.
-        known: fields that Ceres does not report.
-    """
+    """Converts Ceres' summaries of an iteration and of the one before it, which has the gradient at the start of the
+    step, into a `StepInfo`. Of a rejected step they have the candidate's cost only, so the last accepted one is given,
+    and lambda. Only the iterative mode counts conjugate gradients. `known` are fields that Ceres does not report."""
     fields = {
         "previous_cost": previous_cost,
         "gradient_max": before.gradient_max_norm,

@@ -1,4 +1,4 @@
-"""COLMAP's reprojection error for Ceres, and what its Python bindings lack. Needs the extra `ceres`.
+"""A problem as one of Ceres and back, with COLMAP's reprojection error. Needs the extra `ceres`.
 
 The cost function is C++, so that Ceres does not call Python in its inner loops. The camera model is COLMAP's RADIAL
 with parameters `[f, cx, cy, k1, k2]`, and the pose `[quaternion xyzw, translation]` is one parameter block. COLMAP's
@@ -12,9 +12,12 @@ import functools
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import COLMAP_FLIP as FLIP
+from jaxba.problem.geometry import bal_rotations, colmap_quaternions
 
 try:
     # in this order: pycolmap returns objects of pyceres' types
@@ -26,14 +29,9 @@ except ModuleNotFoundError:
 
 pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # a failed factorisation is only a rejected step
 
-POSE_SIZE, LENS_SIZE = 7, 5
-"""Numbers of parameters of a pose and of a RADIAL camera."""
-
-PRINCIPAL_POINT = (1, 2)
-"""Indices of cx and cy among the parameters of a RADIAL camera."""
-
-SMALLEST_DEPTH = float(np.finfo(np.float64).eps)
-"""COLMAP sets the residual of a point to zero if its depth is smaller than this."""
+POSE_SIZE, LENS_SIZE = 7, 5  # numbers of parameters of a pose and of a RADIAL camera
+PRINCIPAL_POINT = (1, 2)  # indices of cx and cy among the parameters of a RADIAL camera
+SMALLEST_DEPTH = float(np.finfo(np.float64).eps)  # below it COLMAP sets a point's residual to zero
 
 
 def backend(mode: str) -> str:
@@ -52,8 +50,7 @@ def pose_manifold() -> Any:
 
     Neither package can create one from Python (pyceres 2.6, pycolmap 4.2.1), so it is taken from a bundle adjuster of
     two images and one point. That problem and the object which `get_manifold` returns both own the manifold and would
-    free it twice. Therefore both are kept until the process ends, which costs a few kilobytes.
-    """
+    free it twice. Therefore both are kept until the process ends, which costs a few kilobytes."""
     model = pycolmap.Reconstruction()
     lens = pycolmap.Camera(camera_id=1, model="RADIAL", width=1, height=1, params=[1.0, 0, 0, 0, 0])
     model.add_camera_with_trivial_rig(lens)
@@ -77,8 +74,7 @@ def pose_manifold() -> Any:
 class TwoSidedReprojection(pyceres.CostFunction):
     """The reprojection error of `reprojection`, also for points behind their camera, as BAL defines it.
 
-    It is evaluated in Python and therefore slow. It is used only for the few observations that COLMAP ignores.
-    """
+    It is evaluated in Python and therefore slow. It is used only for the few observations that COLMAP ignores."""
 
     def __init__(self, pixel: Float[np.ndarray, " 2"]) -> None:
         super().__init__()
@@ -110,3 +106,85 @@ class TwoSidedReprojection(pyceres.CostFunction):
             if target is not None:
                 target[:] = value.ravel()
         return True
+
+
+class ColmapProblem:
+    """The parameters as NumPy arrays, and a `pyceres.Problem` that changes them in place.
+
+    Each camera has its own pose, f, k1 and k2. The principal point is constant and the gauge is free. An observation
+    whose point is not in front of its camera at the start gets the cost function `TwoSidedReprojection`, since COLMAP's
+    would be zero. `count_behind` does the same for points that move behind their camera later.
+
+    Ceres holds raw pointers into `poses`, `lenses` and `points`, and to the cost functions. This object owns all of
+    them, so it must live for as long as `ceres` is used."""
+
+    def __init__(self, problem: BundleProblem) -> None:
+        """Copies the parameters. Raises ProblemError: covariances, lenses, constants, priors or rigs."""
+        parts = problem.whitening, problem.lenses, problem.constants, problem.rigs
+        if problem.residuals or any(part is not None for part in parts):
+            raise ProblemError("Ceres as a peer takes no covariances, lenses, constants, priors or rigs")
+        self.start = problem
+        self.poses, self.lenses, self.points = _parameters(problem)
+        self.pixels = np.asarray(problem.observations, np.float64) * FLIP[:2]
+        self.ceres = pyceres.Problem()
+        self._points, self._poses, self._lenses = list(self.points), list(self.poses), list(self.lenses)
+        self._manifolds = (pose_manifold(), pyceres.SubsetManifold(LENS_SIZE, list(PRINCIPAL_POINT)))
+        self._costs: list[Any] = [None] * problem.num_observations
+        self._residuals: list[Any] = [None] * problem.num_observations
+        # whether the cost function of an observation is the one in Python, shape `(observations,)`
+        self.in_python = geometry.depths(problem) < SMALLEST_DEPTH
+        for observation, behind in enumerate(self.in_python):
+            self._add_observation(observation, TwoSidedReprojection if behind else reprojection)
+        self.observing = np.unique(problem.camera_index)  # cameras that have observations
+        for camera in self.observing:
+            self.ceres.set_manifold(self._poses[camera], self._manifolds[0])
+            self.ceres.set_manifold(self._lenses[camera], self._manifolds[1])
+
+    def _add_observation(self, observation: int, cost: Any) -> None:
+        camera, point = self.start.camera_index[observation], self.start.point_index[observation]
+        self._costs[observation] = cost(self.pixels[observation])
+        blocks = [self._points[point], self._poses[camera], self._lenses[camera]]
+        self._residuals[observation] = self.ceres.add_residual_block(self._costs[observation], None, blocks)
+
+    def count_behind(self, behind: Bool[np.ndarray, " observations"]) -> int:
+        """Replaces cost functions of observations of points that moved behind their camera; returns how many."""
+        new = np.flatnonzero(behind & ~self.in_python).tolist()
+        for observation in new:
+            self.ceres.remove_residual_block(self._residuals[observation])
+            self._add_observation(observation, TwoSidedReprojection)
+        self.in_python[new] = True
+        return len(new)
+
+    def add_point_cost(self, cost: Any, point: int) -> None:
+        """Adds a cost function of one point that is not an observation."""
+        self._costs.append(cost)
+        self.ceres.add_residual_block(cost, None, [self._points[point]])
+
+    def parameters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Copies of `poses`, `lenses` and `points`."""
+        return self.poses.copy(), self.lenses.copy(), self.points.copy()
+
+    def restore(self, parameters: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        """Sets the parameters to what `parameters` returned, in place."""
+        for block, old in zip((self.poses, self.lenses, self.points), parameters, strict=True):
+            block[:] = old
+
+    def set_parameters_of(self, problem: BundleProblem) -> None:
+        """Sets the parameters to those of a problem of the same shape, in place."""
+        self.restore(_parameters(problem))
+
+    def bundle(self) -> BundleProblem:
+        """The problem at the current parameters. Cameras without observations are unchanged."""
+        cameras: Any = np.array(self.start.cameras, np.float64)
+        poses, lenses = self.poses[self.observing], self.lenses[self.observing]
+        cameras[self.observing] = np.hstack([bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]])
+        return self.start.replace(cameras=cameras, points=self.points.copy())
+
+
+def _parameters(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """New arrays of poses `(cameras, 7)`, lenses `(cameras, 5)` and points `(points, 3)` in COLMAP's convention."""
+    cameras = np.asarray(problem.cameras, np.float64)
+    lenses = np.zeros((len(cameras), LENS_SIZE))
+    lenses[:, [0, 3, 4]] = cameras[:, 6:]
+    poses = np.hstack([colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * FLIP])
+    return poses, lenses, np.array(problem.points, np.float64, order="C")

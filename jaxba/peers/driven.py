@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, ProblemInfo
@@ -44,11 +45,8 @@ from jaxba.solver.place import Placed
 from jaxba.solver.solve import Solution
 from jaxba.structure.layout import Layout, build_layout
 
-LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
-"""Limits of the radius, so wide that they do not change the lambda of any policy."""
-
-FORCED_DECREASE = 1e200
-"""Decrease of the cost by `_AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate."""
+LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300  # so wide that they change the lambda of no policy
+FORCED_DECREASE = 1e200  # of the cost by `_AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate
 
 _advance, _begin = jit(advance), jit(begin)
 
@@ -56,8 +54,7 @@ _advance, _begin = jit(advance), jit(begin)
 class _SummaryRecorder(pyceres.IterationCallback):
     """Keeps the summaries of a call of Ceres: of the start, and of the iteration if it was completed.
 
-    One object serves all calls, since assigning `SolverOptions.callbacks` a second time appends to it (pyceres 2.6).
-    """
+    One object serves all calls, since assigning `SolverOptions.callbacks` a second time appends to it (pyceres 2.6)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,8 +69,7 @@ class _AcceptAnyStep(pyceres.CostFunction):
     """A residual that makes Ceres accept any step: large at the first evaluation after `reset`, zero afterwards.
 
     Its Jacobian is zero, so that it does not enter the linear system. It has two residuals and depends on one point,
-    as an observation does, since Ceres has code specialised for these sizes.
-    """
+    as an observation does, since Ceres has code specialised for these sizes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -219,10 +215,10 @@ def _evaluate(
 
     `before` and `after` are `(poses [c, 7], lenses [c, 5], points [p, 3])`. `numbers` of a step are known to Ceres
     alone: the largest gradient entry before it, and the iterations and the forcing term of conjugate gradients, 0 for a
-    direct linear solver.
-    """
+    direct linear solver."""
     flip = jnp.asarray(FLIP)[:, None]
-    rotation = 2 * half_rotation(before[0][:, :4].T, after[0][:, :4].T)
+    first, second = (Rotation.from_quat(poses[:, :4]) for poses, *_ in (before, after))
+    rotation = (second * first.inv()).as_rotvec().T
     lens = (after[1] - before[1]).T
     cameras = jnp.concatenate(
         [flip * rotation, flip * (after[0][:, 4:] - before[0][:, 4:]).T, lens[jnp.array([0, 3, 4])]]
@@ -234,12 +230,3 @@ def _evaluate(
     damped = slope - jnp.sum(change * change)
     proposal = Proposal(Step(cameras, points, slope, damped, *numbers), linear.reference, jnp.zeros((), bool))
     return try_step(layout, state, damping, proposal, options, min_gain)
-
-
-def half_rotation(before: Float[Array, "4 n"], after: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
-    """`v` with `after = exp(v) before` for unit quaternions: half of the rotation vector between them, radians."""
-    v, w = before[:3], before[3]
-    vector = w * after[:3] - after[3] * v - jnp.cross(after[:3], v, axis=0)
-    real = w * after[3] + jnp.sum(after[:3] * v, axis=0)
-    sine = jnp.linalg.norm(vector, axis=0)
-    return jnp.where(sine > 0, jnp.arctan2(sine, real) / jnp.where(sine > 0, sine, 1), 1) * vector

@@ -23,11 +23,8 @@ from jaxba.runtime import compilation
 from jaxba.runtime.executable_cache import PRIVATE
 from jaxba.runtime.numerics import numerics
 
-LIMIT_S = 120
-"""Seconds of processor time after which the process is ended. Those of kitti00vo take fifteen."""
-
-LOCK = "compiling"
-"""File of a folder of programs that the process holds locked."""
+LIMIT_S = 120  # seconds of processor time after which the process is ended. Those of kitti00vo take fifteen
+LOCK = "compiling"  # file of a folder of programs that the process holds locked
 
 
 class Wanted(NamedTuple):

@@ -34,17 +34,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Compilation = Literal["full", "quick", "auto"]
 """`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, full once iterations pay for it."""
 
-Level = Literal["full", "quick"]
-"""How much one program is optimised."""
-
-OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
-"""The option that switches XLA's newer kernel emitters off."""
-
-Kind = Literal["factorization", "iterative"]
-"""How a step solves its linear system."""
-
-COMPILE_EVENTS = "/jax/core/compile/"
-"""Prefix of the durations that JAX reports while it traces, lowers and compiles."""
+Level = Literal["full", "quick"]  # how much one program is optimised
+OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"  # the option that switches XLA's newer kernel emitters off
+Kind = Literal["factorization", "iterative"]  # how a step solves its linear system
+COMPILE_EVENTS = "/jax/core/compile/"  # prefix of the durations that JAX reports while it traces, lowers and compiles
 
 BREAK_EVEN: dict[Kind, int] = {"factorization": 1_200_000, "iterative": 1_000_000}
 """Observations times iterations after which better programs have paid for their compilation, as
@@ -65,18 +58,13 @@ def compiler_options(level: Level) -> Options:
     return quick_options() if level == "quick" else {}
 
 
-def uses_older_emitters(level: Level) -> bool:
-    """Whether programs of a level are compiled by XLA's older kernel emitters, for which `fast_compilation` is made."""
-    return OLDER_EMITTERS in compiler_options(level)
-
-
 class Program:
     """A function compiled by `jax.jit` at a level, for every shape of its arguments, which are given by position."""
 
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
         self.options = right_options() | compiler_options(level)
-        self._fast = uses_older_emitters(level)
+        self._fast = OLDER_EMITTERS in self.options  # for these `fast_compilation` is made
         self._jitted = jax.jit(
             _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
         )
@@ -132,19 +120,16 @@ class ParallelCompilation:
     XLA compiles one program on little more than one core. The thread that leaves the context compiles what is still
     waiting; it is the one that runs the programs, so that the memory that compiling took is reused for running
     (`process.keep_memory`). The context may be entered again for more programs. A program is compiled once, for the
-    arguments that it was given first.
-    """
+    arguments that it was given first."""
 
     def __init__(self) -> None:
-        self.loaded: dict[Program, CachedExecutable] = {}
-        """Programs that were read from disk."""
+        self.loaded: dict[Program, CachedExecutable] = {}  # programs that were read from disk
         self._verified: set[Program] = set()  # of these, the ones that have run once
         # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
         # disk, which are bound to a device
         self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
-        self.late_s = 0.0
-        """Seconds in which `run` has compiled programs that nobody had asked for before."""
+        self.late_s = 0.0  # seconds in which `run` has compiled programs that nobody had asked for before
 
     def __enter__(self) -> ParallelCompilation:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
@@ -253,8 +238,7 @@ class CompileClock:
     """Adds up the time that JAX spends on tracing and compiling while its context is open.
 
     `seconds` may be read at any moment. Compilation in other threads counts too. Tracing one function inside another is
-    reported by both, so the sum can slightly exceed the wall time.
-    """
+    reported by both, so the sum can slightly exceed the wall time."""
 
     def __init__(self) -> None:
         self.seconds = 0.0

@@ -25,20 +25,11 @@ from jaxba.typing import InputError
 
 T = TypeVar("T")
 
-START_S = 300
-"""Seconds that processes wait for each other at the start. JAX's default."""
-
-PATIENCE_S = 5
-"""Seconds after which a process says that it waits for others at the start."""
-
-HEARTBEAT_S = 30
-"""Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
-
-WAIT_MS = 1 << 30
-"""Milliseconds, twelve days, that processes wait for the first one. Gloo's collectives wait half an hour."""
-
-THREADS = 8
-"""Of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill."""
+START_S = 300  # seconds that processes wait for each other at the start. JAX's default
+PATIENCE_S = 5  # seconds after which a process says that it waits for others at the start
+HEARTBEAT_S = 30  # seconds of silence after which a process counts as dead and JAX ends the others; its default is 100
+WAIT_MS = 1 << 30  # twelve days, for which processes wait for the first one; Gloo's collectives wait half an hour
+THREADS = 8  # of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill
 
 LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")
 """What JAX's errors say where another process is gone. They have no class of their own."""
@@ -149,8 +140,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
 def _threads(count: int) -> Iterator[None]:
     """In which JAX starts with so many of XLA's threads for virtual devices, unless it has started or NPROC is set.
 
-    Devices share them: with few, batched factorisations of several wait for each other for ever.
-    """
+    Devices share them: with few, batched factorisations of several wait for each other for ever."""
     if count <= THREADS or "NPROC" in os.environ:
         yield
         return

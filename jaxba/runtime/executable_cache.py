@@ -35,14 +35,9 @@ from jaxba.runtime.atomic import atomic_write
 
 SUFFIX = ".jaxba-program"
 
-LIMIT = 1 << 30
-"""Bytes that a folder's programs may have; the least recently used are removed first."""
-
-IN_MEMORY = 16
-"""Programs read from disk that a process keeps: a solve has six."""
-
-PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
-"""Settings of JAX that change no program."""
+LIMIT = 1 << 30  # bytes that a folder's programs may have; the least recently used are removed first
+IN_MEMORY = 16  # programs read from disk that a process keeps: a solve has six
+PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")  # settings of JAX that change no program
 
 
 class CachedExecutable(NamedTuple):
@@ -72,7 +67,11 @@ class ExecutableCache:
         try:
             leaves, tree = jax.tree.flatten(arguments)
             key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
-            key += map(_describe_type, leaves)
+            weak = lambda leaf: "weak" if getattr(leaf, "weak_type", False) else ""
+            typed = lambda leaf: (
+                f"{leaf.dtype}{leaf.shape}{weak(leaf)}" if hasattr(leaf, "dtype") else type(leaf).__name__
+            )
+            key += map(typed, leaves)
         except _UnknownSource:
             return None
         digest = hashlib.sha256("\n".join([*key, _environment(), self._source]).encode()).hexdigest()
@@ -91,14 +90,10 @@ class ExecutableCache:
         return stored
 
     def save(self, path: Path | None, compiled: jax.stages.Compiled, out: Any) -> None:
-        """Writes a program, whole or not at all; does nothing if it cannot be written.
+        """Writes a program to the path of `path_for`, whole or not at all; does nothing if it cannot be written.
 
-        Args:
-            path: what `path_for` returned.
-            compiled: compiled in this process (`watch_compilation`): a program that JAX has read from its own cache is
-                serialised without some of its functions.
-            out: shapes and types of its results.
-        """
+        It must be compiled in this process (`watch_compilation`): one that JAX has read from its own cache is
+        serialised without some of its functions. `out` are shapes and types of its results."""
         if path is None:
             return
         try:
@@ -112,7 +107,12 @@ class ExecutableCache:
         with contextlib.suppress(OSError):
             with atomic_write(path) as file:
                 file.write(content)
-            self._evict()
+            files = sorted(self.folder.glob(f"*{SUFFIX}"), key=lambda file: -file.stat().st_mtime)
+            total = 0
+            for file in files:  # the least recently used last
+                total += file.stat().st_size
+                if total > LIMIT:
+                    file.unlink(missing_ok=True)
 
     def remove(self, stored: CachedExecutable) -> None:
         """Removes a program that could be read, but not run."""
@@ -120,22 +120,12 @@ class ExecutableCache:
         with contextlib.suppress(OSError):
             stored.path.unlink()
 
-    def _evict(self) -> None:
-        """Removes the least recently used programs, down to `LIMIT`."""
-        found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
-        total = 0
-        for status, file in found:
-            total += status.st_size
-            if total > LIMIT:
-                file.unlink(missing_ok=True)
-
 
 @contextlib.contextmanager
 def watch_compilation() -> Iterator[Callable[[], bool]]:
     """Gives a function that tells whether this thread has compiled a program within the context.
 
-    False where JAX read the program from its own cache instead.
-    """
+    False where JAX read the program from its own cache instead."""
     thread, events = threading.get_ident(), set()
 
     def listen(event: str, *_: Any, **__: Any) -> None:
@@ -152,8 +142,7 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
         monitoring.unregister_event_duration_listener(listen)
 
 
-_readers = ThreadPoolExecutor(max_workers=2)
-"""Read programs, whose machine code takes XLA 0.1 s each, while others are looked for."""
+_readers = ThreadPoolExecutor(max_workers=2)  # read programs, XLA each in 0.1 s, while others are looked for
 
 
 @functools.lru_cache(maxsize=IN_MEMORY)
@@ -244,12 +233,6 @@ def _describe_tree(tree: Any) -> str:
         return "*"
     kind, metadata = node
     return f"{_name(kind)} {_describe(metadata)} [{', '.join(map(_describe_tree, tree.children()))}]"
-
-
-def _describe_type(leaf: Any) -> str:
-    if not hasattr(leaf, "dtype"):
-        return type(leaf).__name__
-    return f"{leaf.dtype}{leaf.shape}{'weak' if getattr(leaf, 'weak_type', False) else ''}"
 
 
 def _environment() -> str:

@@ -12,26 +12,13 @@ import time
 from types import FrameType
 from typing import Any
 
-INTERRUPTED = 128 + signal.SIGINT
-"""Exit status after Ctrl-C, as shells define it."""
-
-TERMINATED = 128 + signal.SIGTERM
-"""Exit status after SIGTERM."""
-
-ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}
-"""Last line of a command that a signal has ended."""
-
-SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}
-"""The signals, and what after one of them stops at once."""
-
-EXIT_DELAY_S = 1.0
-"""Seconds from a second signal to the process's end; Python handles none while a compiled program runs."""
-
-RAISE_AGAIN_S = 0.01
-"""Seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended."""
-
-_HANDLED = 0
-"""Byte that the signal handler sends to the thread when it raises KeyboardInterrupt; no signal has this number."""
+INTERRUPTED = 128 + signal.SIGINT  # exit status after Ctrl-C, as shells define it
+TERMINATED = 128 + signal.SIGTERM  # exit status after SIGTERM
+ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}  # last line of a command that a signal has ended
+SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}  # and what stops at once after one
+EXIT_DELAY_S = 1.0  # seconds from a second signal to the end; Python handles none while a compiled program runs
+RAISE_AGAIN_S = 0.01  # seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended
+_HANDLED = 0  # byte that the handler sends to the thread when it raises KeyboardInterrupt; no signal's number
 
 
 class Interrupt:
@@ -40,11 +27,9 @@ class Interrupt:
     Nothing is changed in a thread other than the first, where signals are not handled.
 
     With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a compiled
-    program the first one prints a message, and the second ends the process: files are atomic.
-    """
+    program the first one prints a message, and the second ends the process: files are atomic."""
 
-    status = 0
-    """Exit status after the signal that came last; 0 before any."""
+    status = 0  # exit status after the signal that came last; 0 before any
 
     def __init__(self, unit: str = "", *, graceful: bool = False) -> None:
         """Does nothing yet. `unit` is what is finished after the first signal, for the message, e.g. `iteration`.

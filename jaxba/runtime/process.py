@@ -23,17 +23,10 @@ from threadpoolctl import ThreadpoolController
 
 T = TypeVar("T")
 
-_TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
-"""Parameter numbers of glibc's mallopt (malloc.h)."""
-
-MAPPINGS_SHARE = 0.4
-"""Share of the limit of memory mappings at which programs are dropped. Sixteen solvers took a tenth of it."""
-
-GROWTH_SHARE = 0.1
-"""Growth, as such a share, below which they are not dropped again: mappings that are not JAX's stay."""
-
-_mappings_left = 0
-"""Mappings that were left when programs were dropped last."""
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4  # parameter numbers of glibc's mallopt (malloc.h)
+MAPPINGS_SHARE = 0.4  # share of the limit of mappings at which programs are dropped; sixteen solvers took a tenth
+GROWTH_SHARE = 0.1  # growth, as such a share, below which they are not dropped again: mappings that are not JAX's stay
+_mappings_left = 0  # mappings that were left when programs were dropped last
 
 
 def threads() -> int:
@@ -113,10 +106,8 @@ def _mappings() -> int:
 
 
 _blas_lock = threading.Lock()
-_blas_users = 0
-"""Contexts of `single_blas_thread` that are open, in all threads."""
-_blas_limit: Any = None
-"""What the first of them has set, which the last takes back."""
+_blas_users = 0  # contexts of `single_blas_thread` that are open, in all threads
+_blas_limit: Any = None  # what the first of them has set, which the last takes back
 
 
 @contextlib.contextmanager
@@ -124,8 +115,7 @@ def single_blas_thread() -> Iterator[None]:
     """A context in which BLAS uses one thread. Contexts of several threads may overlap.
 
     XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call and take the
-    processor from XLA's own threads; beside another busy process an iteration became ten times slower.
-    """
+    processor from XLA's own threads; beside another busy process an iteration became ten times slower."""
     global _blas_users, _blas_limit
     with _blas_lock:
         if not _blas_users:
@@ -151,8 +141,7 @@ def _as_owner_of_blas(change: Callable[[], T]) -> T:
     return changed
 
 
-_forked_from_jax = False
-"""Whether this process is the fork of one in which JAX had started."""
+_forked_from_jax = False  # whether this process is the fork of one in which JAX had started
 
 
 def refuse_fork() -> None:

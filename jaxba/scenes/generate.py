@@ -11,8 +11,7 @@ from jaxba.scenes.tracks import track_lengths
 from jaxba.scenes.trajectory import Path, make_path, true_cameras
 from jaxba.scenes.visibility import TrueCameras, Views, place_points
 
-MAX_PATHS = 8
-"""Random paths to try. Only small scenes with many observations per point need more than one."""
+MAX_PATHS = 8  # random paths to try. Only small scenes with many observations per point need more than one
 
 
 def random_scene(config: SceneConfig, seed: int | np.random.Generator) -> BundleProblem:

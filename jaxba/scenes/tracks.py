@@ -11,8 +11,7 @@ TAIL_EXPONENT = 1.4
 """Exponent a of the power law. Maximum-likelihood fits gave 1.29 on BAL's Trafalgar-21, 1.33 on stereo odometry of
 KITTI 00 and 1.54 on BAL's Ladybug-49; the cut-off b follows from the mean."""
 
-MIN_LENGTH = 2
-"""Views that determine the position of a point."""
+MIN_LENGTH = 2  # views that determine the position of a point
 
 
 @lru_cache(maxsize=64)

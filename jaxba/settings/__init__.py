@@ -19,8 +19,7 @@ from jaxba.settings.configurations import SettingsError
 
 Settings = TypeVar("Settings")
 
-_SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
-"""Numbers such as 3e-4, which YAML 1.1 reads as text."""
+_SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # numbers such as 3e-4, which YAML 1.1 reads as text
 
 _SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 

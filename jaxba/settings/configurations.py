@@ -15,11 +15,8 @@ from jaxba.io.encoding import plain_text
 from jaxba.io.files import display_name, reason, visible
 from jaxba.typing import InputError
 
-Kind: TypeAlias = Literal["train", "paper", "bench"]
-"""Command that reads a configuration, and its folder's name."""
-
-BASE = "extends"
-"""Key of a file that names its base."""
+Kind: TypeAlias = Literal["train", "paper", "bench"]  # command that reads a configuration, and its folder's name
+BASE = "extends"  # key of a file that names its base
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

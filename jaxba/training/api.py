@@ -25,8 +25,7 @@ from jaxba.typing import register_pytree
 if TYPE_CHECKING:
     from jaxba.game.gym import GymGame, GymVectorGame
 
-EVALUATIONS = 10
-"""Evaluations of a training, after equal parts of it."""
+EVALUATIONS = 10  # evaluations of a training, after equal parts of it
 
 
 @register_pytree

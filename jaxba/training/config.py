@@ -33,8 +33,7 @@ CG_ROUNDS = 2
 """Iterations of `cg` per unknown of the cameras. One is enough without rounding. Two leave a predicted decrease within
 1e-10 of the exact one, 10 x 10 scenes at lambda 1e-10."""
 
-METADATA_BYTES = 1 << 14
-"""Reserved for the metadata of a policy file, of which the configuration takes 3 kB."""
+METADATA_BYTES = 1 << 14  # reserved for the metadata of a policy file, of which the configuration takes 3 kB
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,9 @@ from jaxba.training.train_loop import LoopState, run_agents, start_agents
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 
-_METADATA = ("chunk", "wall_s", "evaluated", "best")
-"""What a checkpoint holds besides arrays."""
-
-CHANGEABLE = ("chunks", "keep", "checkpoint_every")
-"""Settings that a resumed run may change."""
-
-SCORE = "training/score"
-"""The metric by which policies are chosen: lower is better."""
+_METADATA = ("chunk", "wall_s", "evaluated", "best")  # what a checkpoint holds besides arrays
+CHANGEABLE = ("chunks", "keep", "checkpoint_every")  # settings that a resumed run may change
+SCORE = "training/score"  # the metric by which policies are chosen: lower is better
 
 
 class Best(NamedTuple):
@@ -177,50 +172,40 @@ class _Run:
         if checkpoint.steps(self.folder):
             self._restore_latest(like)
         else:
-            self._begin(like)
+            fresh = start_agents(config.sac, config.loop, env, _keys(config))
+            self.state: LoopState = checkpoint.unpack(checkpoint.pack(fresh), like)  # laid out as after a checkpoint
         evaluate(_agent(self.state.learner.actor, 0))  # compiles its programs
         self._compiled = loop.result()
         self.log = Log(folder, self.chunk, hooks.note)
         hooks.stage("training")
 
-    def _begin(self, like: Any) -> None:
-        fresh = start_agents(self.config.sac, self.config.loop, self.env, _keys(self.config))
-        self.state: LoopState = checkpoint.unpack(
-            checkpoint.pack(fresh), like
-        )  # the same memory layout as after a checkpoint
-
     def _restore_latest(self, like: Any) -> None:
         """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
-        (self.chunk, self.wall_s, self.evaluated, best), arrays = self._read_latest(like)
-        self.state = checkpoint.unpack(arrays, {"state": like})["state"]
-        if best:
-            host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
-            actors = checkpoint.unpack(arrays, {"best": host})["best"]
-            self.best = tuple(Best(_agent(actors, k), agent=k, **one) for k, one in enumerate(best))
-
-    def _read_latest(self, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
         reasons = []
         for step in reversed(checkpoint.steps(self.folder)):
             try:
-                metadata, arrays = self._read(step, like)
+                self._restore(step, like)
             except TrainError as error:
                 reasons.append(str(error))
                 continue
             if reasons:
-                self.hooks.note(f"{reasons[0]}; going on from the one before, after chunk {metadata[0]}")
-            return metadata, arrays
+                self.hooks.note(f"{reasons[0]}; going on from the one before, after chunk {self.chunk}")
+            return
         others = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise TrainError(f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder")
 
-    def _read(self, step: int, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
+    def _restore(self, step: int, like: Any) -> None:
         arrays, metadata = checkpoint.restore(self.folder, step)
         try:
-            found = [metadata[name] for name in _METADATA]
-            best = [Best(None, agent=k, **one) for k, one in enumerate(found[-1])]
+            self.chunk, self.wall_s, self.evaluated, best = (metadata[name] for name in _METADATA)
+            found = [Best(None, agent=k, **one) for k, one in enumerate(best)]
         except (KeyError, TypeError) as error:
             raise TrainError(f"checkpoint {step} was written by another version: {error}") from None
-        checkpoint.check(arrays, {"state": like, **({"best": like.learner.actor} if best else {})})
-        return found, arrays
+        self.state = checkpoint.unpack(arrays, {"state": like})["state"]
+        if found:
+            host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
+            actors = checkpoint.unpack(arrays, {"best": host})["best"]
+            self.best = tuple(one._replace(actor=_agent(actors, one.agent)) for one in found)
 
     def _save(self) -> None:
         arrays = checkpoint.pack({"state": self.state})
@@ -245,8 +230,7 @@ class _Run:
                 return Outcome(False, self.best, self.state)
         if self.evaluated != self.chunk:  # `chunks` was larger when the run began
             self.hooks.stage("evaluating the last policies")
-            actors = self._actors()
-            self._evaluate(actors)
+            self._evaluate(self._actors())
         return Outcome(True, self.best, self.state)
 
     def _actors(self) -> list[Any]:
@@ -280,17 +264,11 @@ class _Run:
             row: Row = {"seed": k, "chunk": self.chunk, "env_steps": int(counts[0][k]), "updates": int(counts[1][k])}
             rows.append({**row, **clocks, **{name: float(value[k]) for name, value in means.items()}})
         due = self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks
-        actors = self._actors() if due else []
-        return self._report(rows, actors)
-
-    def _report(self, rows: list[Row], actors: list[Any]) -> bool:
-        """Writes the rows of a chunk, with the scores of the policies if there are any. Whether the run is to end."""
-        if actors:
+        if due:
             wall = time.perf_counter()
-            for row, scores in zip(rows, self._evaluate(actors), strict=True):
-                row |= scores
-            seconds = time.perf_counter() - wall
-            rows = [{**row, "evaluate_s": seconds} for row in rows]
+            scored = self._evaluate(self._actors())
+            clocks = {"evaluate_s": time.perf_counter() - wall}
+            rows = [{**row, **scores, **clocks} for row, scores in zip(rows, scored, strict=True)]
         self.hooks.rows([self.log.write(row) for row in rows])
         return self.hooks.stop()
 

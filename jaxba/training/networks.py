@@ -16,14 +16,9 @@ from flax import linen as nn
 from jax import Array
 from jaxtyping import Float
 
-LAST_LAYER = 3e-3
-"""Bound of the uniform initial weights of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
-
-LOG_STD_MAX = 2.0
-"""Upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code."""
-
-LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))
-"""Largest float32 below one; tanh in float32 can round to one."""
+LAST_LAYER = 3e-3  # bound of uniform initial weights of last layers. Source: Lillicrap et al. 2016 (DDPG), section 7
+LOG_STD_MAX = 2.0  # upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code
+LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))  # the largest below one, to which tanh can round
 
 
 def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
@@ -34,8 +29,7 @@ class MLP(nn.Module):
     """Hidden layers of one width with ReLU, and a linear last layer with small initial weights.
 
     With `layer_norm` each hidden layer is normalised before its ReLU, without learned scale and shift, which the next
-    layers have: an update of width 64 takes a tenth less time. Source: Ba et al. 2016; in critics Ball et al. 2023.
-    """
+    layers have: an update of width 64 takes a tenth less time. Source: Ba et al. 2016; in critics Ball et al. 2023."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -95,8 +89,7 @@ class Actor(nn.Module):
     """Mean and logarithm of the standard deviation of the pre-tanh action.
 
     The logarithm is bounded by a sigmoid, whose gradient never vanishes as that of a clip does. It is zero where the
-    network's output is zero, so that an untrained policy is spread over all of (-1, 1).
-    """
+    network's output is zero, so that an untrained policy is spread over all of (-1, 1)."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -128,8 +121,7 @@ def log_probability(
     """Log density of `u = tanh(x)`, nats, for `x = mean + exp(log_std) noise`.
 
     `log N(x) - log(1 - u^2)` with `log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x))`, which neither overflows nor
-    cancels for large `x`. Source: Haarnoja et al. 2018, appendix C; the stable form is TensorFlow Probability's.
-    """
+    cancels for large `x`. Source: Haarnoja et al. 2018, appendix C; the stable form is TensorFlow Probability's."""
     normal = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
     log_det = 2 * (math.log(2) - pre_tanh - jax.nn.softplus(-2 * pre_tanh))
     return jnp.sum(normal - log_det, axis=-1)

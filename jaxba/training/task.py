@@ -31,11 +31,8 @@ from jaxba.training.config import TrainConfig
 BANK = "bank.npz"
 RULES = "rules.npz"
 
-EMBEDDED = "+embedded"
-"""Ending of the name of a rule that has the embedded iterations of the agent's step."""
-
-CONSTANT = "constant action"
-"""Name of the best constant action on training scenes."""
+EMBEDDED = "+embedded"  # ending of the name of a rule that has the embedded iterations of the agent's step
+CONSTANT = "constant action"  # name of the best constant action on training scenes
 
 BASELINES = (
     "ceres",
@@ -54,11 +51,8 @@ BASELINES = (
 smallest lambda that the game's own guard allows, with the agent's step. `guarded` and `learned` are what ships, with
 their own steps and guards."""
 
-TRAINED = "trained"
-"""Name of the trained policy in tables."""
-
-WEIGHTLESS = "its weights zero"
-"""Name of the trained policy without its weights (`without_weights`)."""
+TRAINED = "trained"  # name of the trained policy in tables
+WEIGHTLESS = "its weights zero"  # name of the trained policy without its weights (`without_weights`)
 
 
 Comparison: TypeAlias = tuple[dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]]

@@ -11,8 +11,7 @@ from jaxba.solver.figure import COLOURS
 from jaxba.viewer.extra import viser
 from jaxba.viewer.stage import Stage
 
-TITLE = "log10 (f - f*) / f*, f* the lowest"
-"""What the curve shows of the cost f."""
+TITLE = "log10 (f - f*) / f*, f* the lowest"  # what the curve shows of the cost f
 
 FONT = {"font": "10px sans-serif"}
 

@@ -13,8 +13,7 @@ except ModuleNotFoundError:
 
 __all__ = ["HOST", "quietly", "viser"]
 
-HOST = "127.0.0.1"
-"""Address under which only this machine reaches the page."""
+HOST = "127.0.0.1"  # address under which only this machine reaches the page
 
 
 def quietly(act: Callable[..., Any], **options: Any) -> Any:

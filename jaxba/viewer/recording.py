@@ -22,11 +22,8 @@ from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import Labels
 from jaxba.solver.drivers import IterationRecord
 
-RECORDED_POINTS = 20_000
-"""Most points of a recording: a hundred iterations take some 20 MB."""
-
-ENDING = ".npz"
-"""Of the names of recordings."""
+RECORDED_POINTS = 20_000  # most points of a recording: a hundred iterations take some 20 MB
+ENDING = ".npz"  # of the names of recordings
 
 
 @dataclass(frozen=True)

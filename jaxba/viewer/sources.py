@@ -18,8 +18,7 @@ from jaxba.io.frames import Sidecar, read_sidecar
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.viewer.recording import ENDING, Recording, read_recording, still
 
-SMALL_SIDE = 480
-"""Pixels of the longer side of an image that is not chosen."""
+SMALL_SIDE = 480  # pixels of the longer side of an image that is not chosen
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,9 @@ from jaxba.viewer.measures import Measures, colours, limits, measure
 from jaxba.viewer.recording import evenly
 from jaxba.viewer.sources import Shown
 
-SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500
-"""Most points and cameras on a page. Software rendering draws them at a few frames a second."""
-
-POINT_SIZE = 0.006
-"""Of points; scenes have a size of about one."""
-
-ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)
-"""Distance between the middles of neighbouring stages, and where the name of one of several stands."""
+SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500  # most on a page; software rendering draws them at a few frames a second
+POINT_SIZE = 0.006  # of points; scenes have a size of about one
+ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)  # distance between neighbouring stages, and where the name of one of several is
 
 FILE, ERROR, TRACK, IMAGE = "colour of the file", "reprojection error", "track length", "error of images"
 """What colours may mean, the first three those of points."""
@@ -34,8 +29,7 @@ CHOSEN, CHOSEN_SIDE, RESIDUAL = (255, 120, 0), 1600, (208, 0, 0)
 KINDS = ((0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (213, 94, 0))
 """Colours of residuals besides those of pixels. Source: Okabe and Ito 2008, "Color Universal Design"."""
 
-BEFORE, TYPICAL = 0.99, 0.015
-"""Depth of residuals, as a share of that of their image, and the length of the median one, as a share of its width."""
+BEFORE, TYPICAL = 0.99, 0.015  # shares: depth of residuals in their image's, median length in its width
 
 
 class Stage:
@@ -145,7 +139,11 @@ class Stage:
         points, poses = similarity.points(np.asarray(problem.points)), similarity.poses(camera_poses(problem.cameras))
         with self._server.atomic():
             kept = self.kept()
-            layers.cloud("points", points[kept], self._colours()[kept], self.point_size)
+            name = TRACK if self.colour == TRACK else ERROR
+            of_points = colours(self._values()[name], *self.limits[name])
+            if self.colour == FILE and self._file_colours is not None:
+                of_points = self._file_colours
+            layers.cloud("points", points[kept], of_points[kept], self.point_size)
             shown = set(self.frusta.tolist()) | ({self.chosen} if self.chosen is not None else set())
             of_image = colours(measures.of_image, *self.limits[IMAGE])
             for camera in sorted(shown):
@@ -169,12 +167,6 @@ class Stage:
             for number, segments in enumerate(geometry.row_segments(problem)):
                 ends = similarity.points(segments.reshape(-1, 3)).reshape(-1, 2, 3)
                 layers.lines(f"rows {number}", ends, KINDS[number % len(KINDS)], 1.0)
-
-    def _colours(self) -> np.ndarray:
-        if self.colour == FILE and self._file_colours is not None:
-            return self._file_colours
-        name = TRACK if self.colour == TRACK else ERROR
-        return colours(self._values()[name], *self.limits[name])
 
     def _values(self) -> dict[str, np.ndarray]:
         found = self.measures

@@ -10,8 +10,7 @@ import numpy as np
 from jaxba.model.registration import costs_of_rows
 from jaxba.viewer.stage import ERROR, FILE, KINDS, Stage
 
-WORST, WORST_ROWS = 20, 5
-"""Images in the list of the worst; rows of a residual, and images that see a point."""
+WORST, WORST_ROWS = 20, 5  # images in the list of the worst; rows of a residual, and images that see a point
 
 
 def plain(name: str) -> str:

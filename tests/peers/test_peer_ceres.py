@@ -43,8 +43,7 @@ pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
 from jaxba.peers.ceres import Run, solve_by_ceres, solver_options
-from jaxba.peers.colmap import TwoSidedReprojection, backend, pyceres, reprojection
-from jaxba.peers.colmap_problem import ColmapProblem
+from jaxba.peers.colmap import ColmapProblem, TwoSidedReprojection, backend, pyceres, reprojection
 from jaxba.peers.driven import drive_ceres
 
 pytestmark = pytest.mark.extra
@@ -169,7 +168,7 @@ import gc, sys
 import numpy as np
 from jaxba import scene_like, random_scene
 from jaxba.peers.colmap import pyceres
-from jaxba.peers.colmap_problem import ColmapProblem
+from jaxba.peers.colmap import ColmapProblem
 colmaps = [ColmapProblem(random_scene(scene_like("tiny"), seed)) for seed in range(3)]
 del colmaps[1]
 gc.collect()

@@ -24,14 +24,9 @@ try:
 except ModuleNotFoundError:  # not a POSIX system: there two processes must not download the same file
     fcntl = None
 
-BASE_URL = "https://grail.cs.washington.edu/projects/bal/data"
-"""The data set's own server."""
-
-TIMEOUT_S = 30.0
-"""Time without any data from the server after which a download fails."""
-
-BLOCK_BYTES = 1 << 16
-"""Bytes between two reports of progress; a broken connection loses fewer than that."""
+BASE_URL = "https://grail.cs.washington.edu/projects/bal/data"  # the data set's own server
+TIMEOUT_S = 30.0  # time without any data from the server after which a download fails
+BLOCK_BYTES = 1 << 16  # bytes between two reports of progress; a broken connection loses fewer than that
 
 Report = Callable[[int, int | None], object]
 """Called with the bytes received so far, and the size of the whole file or None if the server does not report it."""

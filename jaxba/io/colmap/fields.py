@@ -86,8 +86,7 @@ READERS: dict[str, Callable[[Any], Any]] = {"cameras": _read_camera, "rigs": _re
 FIRST = {"cameras": CAMERA, "images": IMAGE, "points3D": POINT, "rigs": RIG, "frames": FRAME}
 """The fields with which a record of each file begins."""
 
-Values = Iterator[tuple[Fields, tuple[Any, ...]]]
-"""Fields and their values, one group after the other."""
+Values = Iterator[tuple[Fields, tuple[Any, ...]]]  # fields and their values, one group after the other
 
 
 def values(record: Camera | Image | Rig | Frame) -> Values:

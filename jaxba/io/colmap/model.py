@@ -19,12 +19,8 @@ from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
 
-PARTS = ("cameras", "images", "points3D")
-"""Files that every model has."""
-
-RIG_PARTS = ("rigs", "frames")
-"""Files that models have since COLMAP 3.12, both or none."""
-
+PARTS = ("cameras", "images", "points3D")  # files that every model has
+RIG_PARTS = ("rigs", "frames")  # files that models have since COLMAP 3.12, both or none
 _LONGEST_NAME = 60  # of an image in messages
 
 
@@ -35,29 +31,17 @@ MODELS = (
 )
 """Camera models of COLMAP, of which each has its place as its number in a binary file."""
 
-NO_ID = 2**32 - 1
-"""COLMAP's id of no camera, image, rig or frame, and its index of no key-point."""
-
-NO_POINT = 2**64 - 1
-"""COLMAP's id of no point; -1 in a text file."""
-
-LARGEST_RATIO = 1e6
-"""Of the focal lengths of a lens; a larger one is damage."""
-
-CAMERA_SENSOR = 0
-"""Number of the sensor type of cameras."""
-
-SENSORS = {"CAMERA": CAMERA_SENSOR, "IMU": 1}
-"""Numbers of sensor types by name."""
-
-KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
-"""A key-point: pixels, and the id of its point or `NO_POINT`."""
+NO_ID = 2**32 - 1  # COLMAP's id of no camera, image, rig or frame, and its index of no key-point
+NO_POINT = 2**64 - 1  # COLMAP's id of no point; -1 in a text file
+LARGEST_RATIO = 1e6  # of the focal lengths of a lens; a larger one is damage
+CAMERA_SENSOR = 0  # number of the sensor type of cameras
+SENSORS = {"CAMERA": CAMERA_SENSOR, "IMU": 1}  # numbers of sensor types by name
+KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])  # a key-point: pixels, and the id of its point or `NO_POINT`
 
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 """A point, with the number of elements of its track. As in a binary file, where the track follows."""
 
-TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])
-"""An element of a track: id of an image, and index of one of its key-points."""
+TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])  # an element of a track: an image, and which of its key-points
 
 
 @dataclass(frozen=True)

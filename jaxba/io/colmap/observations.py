@@ -14,8 +14,7 @@ from jaxtyping import Int, Shaped
 from jaxba.io.colmap.model import KEY, NO_POINT, Image, Model
 from jaxba.io.notes import counted
 
-Views = Int[np.ndarray, "3 _"]
-"""Image, key-point and point of each view: positions in an `Ordered`."""
+Views = Int[np.ndarray, "3 _"]  # image, key-point and point of each view: positions in an `Ordered`
 
 
 class Ordered(NamedTuple):

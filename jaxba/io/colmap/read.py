@@ -23,8 +23,7 @@ from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.labels import Labels
 from jaxba.problem.rigs import Rigs
 
-_EDGE = 0.01
-"""A principal point is at the edge of an image within this fraction of its size."""
+_EDGE = 0.01  # a principal point is at the edge of an image within this fraction of its size
 
 
 class Assembled(NamedTuple):

@@ -28,14 +28,12 @@ DISTORTIONS = {
 }
 """Models that are read, as `type` calls them and as `distortionType` does, and how many coefficients they have."""
 
-SENSOR_WIDTH = 36.0
-"""Millimetres, where a file does not say. Source: `loadIntrinsic`."""
+SENSOR_WIDTH = 36.0  # millimetres, where a file does not say. Source: `loadIntrinsic`
 
 PARTS = ("version", "featuresFolders", "matchesFolders", "views", "intrinsics", "poses", "structure")
 """Parts of a file that are read, or say where features are."""
 
-LOCKS = ("scaleLocked", "offsetLocked", "distortionLocked")
-"""Flags of intrinsics that hold a part of them; `locked`, which holds all, is read."""
+LOCKS = ("scaleLocked", "offsetLocked", "distortionLocked")  # flags that hold parts; `locked`, of all, is read
 
 _PROGRAM = "AliceVision"
 

@@ -24,11 +24,8 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, are_rotations, translations
 from jaxba.typing import LARGEST_COUNT
 
-HEADERS = (b"NVM_V3", b"NVM_V3_R9T")
-"""First words of the versions that are read."""
-
-_SMALLEST_DETERMINANT = 1e-6
-"""Of the derivative of the distortion; below it the image folds over itself."""
+HEADERS = (b"NVM_V3", b"NVM_V3_R9T")  # first words of the versions that are read
+_SMALLEST_DETERMINANT = 1e-6  # of the derivative of the distortion; below it the image folds over itself
 
 _FIELDS = ("f", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "r", "0")
 _FIELDS_R9T = ("f", *(f"R{row}{column}" for row in "123" for column in "123"), "tx", "ty", "tz", "r", "0")

@@ -21,23 +21,18 @@ from jaxba.io.notes import note, note_unused
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
-"""Begins the first line of tracks; files of version 0 have no such line."""
-
-FIELDS = {0: 8, 1: 9, 2: 11}
-"""Fields of a line of tracks by version: image, track, key-point, x, y, ..."""
+TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"  # begins the first line of tracks; files of version 0 have no such line
+FIELDS = {0: 8, 1: 9, 2: 11}  # fields of a line of tracks by version: image, track, key-point, x, y, ...
 
 _RADIAL = {"simple_radial": 1, "radial": 2, "brown": 3, "fisheye_opencv": 4}
 """Models with two focal lengths and a principal point, and how many radial coefficients they have."""
 
-MODELS = ("perspective", "fisheye", *_RADIAL)
-"""Camera models that are read."""
+MODELS = ("perspective", "fisheye", *_RADIAL)  # camera models that are read
 
 PARTS = ("cameras", "shots", "points", "rig_cameras", "rig_instances", "biases", "reference_lla", "reference")
 """Parts of a reconstruction that are read, or that say nothing without measured positions."""
 
-CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")
-"""Files of control points beside a reconstruction."""
+CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")  # files of control points beside a reconstruction
 
 
 def recognises(document: Record) -> bool:
