@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,7 +22,18 @@ import jaxba
 from benchmarks.default_policy import cases
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
-from jaxba.solver.recipes import Recipe
+from jaxba.solver.recipes import RECIPES
+
+
+class Recipe(NamedTuple):
+    """A candidate."""
+
+    policy: str
+    lenses_first: bool = False  # whether it begins with a solve that holds all lenses
+
+    def __str__(self) -> str:
+        return f"{self.policy}{', lenses held first' * self.lenses_first}"
+
 
 CANDIDATES = (
     *(Recipe(policy) for policy in ("guarded", "bold", "ceres", "ceres+embedded", "nielsen+embedded")),
@@ -90,6 +102,7 @@ def main() -> None:
     print(
         f"first K recipes: windows of the choice that end above the best by {heading} | judged windows | alone, judged"
     )
+    print(f"now: {', '.join(RECIPES)}")
     for count, last in enumerate(chosen, 1):
         shares = [
             "  ".join(f"{np.mean(rows > one):4.0%}" for one in ABOVE)

@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
     from jaxba.results.retriangulate import Retriangulation, retriangulate
     from jaxba.solver.many import solve_many
+    from jaxba.solver.recipes import solve_recipes
     from jaxba.training.api import make_env, train
     from jaxba.viewer.notebook import view
 
@@ -90,6 +91,7 @@ _LATE = {
     "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
     "results.retriangulate": ("Retriangulation", "retriangulate"),
     "solver.many": ("solve_many",),
+    "solver.recipes": ("solve_recipes",),
     "training.api": ("make_env", "train"),
     "viewer.notebook": ("view",),
 }
@@ -181,6 +183,7 @@ __all__ = [
     "solve_and_retriangulate",
     "solve_loop",
     "solve_many",
+    "solve_recipes",
     "train",
     "trained_step",
     "view",

@@ -112,6 +112,9 @@ class Step:
     """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. deeplm: conjugate
     gradients on all variables."""
 
+    recipes: int | None = None
+    """Solve by so many policies side by side, this one and the next of a list; the lowest end wins."""
+
     refine_points: int | None = None
     """Point iterations after each camera step. Default: those that the policy brings (guarded, bold, learned); none
     for a rule."""
@@ -141,12 +144,12 @@ class Step:
     """mixed: float64, but the reduced camera system in float32."""
 
     pad: Literal["auto", "yes", "no"] = "auto"
-    """Pad sizes, so that similar problems share a compiled program, also between calls; for the explicit solver without
-    lenses. auto: up to 64 cameras and 60,000 observations, not if fully compiled."""
+    """Pad sizes, so that similar problems share a compiled program. auto: up to 64 cameras and 60,000 observations, not
+    if fully compiled."""
 
     compilation: Compilation = DEFAULTS.compilation
-    """quick: compile in a third of the time, for iterations that take two to six times as long. full: the contrary.
-    auto: full once that pays; on a GPU always."""
+    """quick: compile in a third of the time, and iterate two to six times as long. full: the contrary. auto: full once
+    that pays; on a GPU always."""
 
     settings: Annotated[str | None, "FILE"] = None
     """YAML file of options of this command. The command line wins."""
@@ -344,7 +347,8 @@ def _solve(args: Arguments) -> int:
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     watch, end = view.watched(problem, path, args.record, args.view)
-    solution, steps = _iterate(args, problem, policy, options, watch)
+    run = _iterate if args.recipes is None else _by_recipes
+    solution, steps = run(args, problem, policy, options, watch)
     common.print_line(table.summary(problem, solution, options.loss))
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
@@ -423,6 +427,23 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
         arrays = ("poses", "lenses", "points", "points_given_cameras")
         np.savez_compressed(file, **{name: getattr(found, name) for name in arrays})
     common.print_line(f"wrote {path}")
+
+
+def _by_recipes(
+    args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions, watch: Watch | None
+) -> tuple[Solution, list[IterationRecord]]:
+    """Solves by several policies, and prints the end of each; the lowest one is the solution."""
+    from jaxba.solver.recipes import RECIPES, solve_recipes
+
+    common.require(args.recipes in range(2, len(RECIPES) + 1), f"--recipes must be 2 to {len(RECIPES)}")
+    others = {"--record": args.record, "--view": args.view, "--log": args.log, "--retriangulate": args.retriangulate}
+    given = [name for name, value in {**others, "--devices and --processes": _is_divided(args)}.items() if value]
+    common.require(not given, f"{', '.join(given)}: for one policy, not for --recipes")
+    with common.notes_printed():
+        found = solve_recipes(problem, args.recipes, policy, options)
+    for name, one in zip((args.policy, *RECIPES[1:]), found, strict=False):
+        common.print_line(f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}")
+    return min(found, key=lambda one: one.final_cost), []
 
 
 def _iterate(

@@ -98,6 +98,7 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     distance = solution.distance
     left = f"; estimated within {distance:.1e} of the end" if math.isfinite(distance) else ""
     lines = [
+        f"{solution.num_residuals} residuals, {solution.num_parameters} parameters",
         f"{state}: {solution.termination.reason}{left}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
         *by_kind,

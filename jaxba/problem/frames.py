@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import angle_axis
+from jaxba.problem.hold import every_lens
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.preprocess import observed
 from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs, first_of_group, frame_poses, poses_in_frames
 
 
@@ -49,6 +51,20 @@ def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
         of_lens = of_lens | of_lens[:, 3:].any(axis=1, keepdims=True)  # M turns t_r, too
         places = np.asarray(rigs.free)[:, None] & ~of_lens
     return np.hstack([~_any_of_group(np.asarray(rigs.frame), held), places])
+
+
+def num_unknowns(problem: BundleProblem) -> int:
+    """How many numbers of a problem are optimised: of poses, lenses, places in rigs, observed points and blocks of
+    residuals, each once. Source: Ceres, `num_effective_parameters_reduced`."""
+    here, (cameras, points) = in_frames(problem), observed(problem)
+    free, seen, lenses = free_poses(here), np.flatnonzero(cameras), every_lens(problem)
+    lens = np.asarray(lenses.index)
+    frame = np.arange(len(free)) if here.rigs is None else np.asarray(here.rigs.frame)
+    frames, images = (seen[np.unique(group[seen], return_index=True)[1]] for group in (frame, lens))
+    points = points if problem.constants is None else points & ~np.asarray(problem.constants.points)
+    blocks = sum(block.size for block in problem.residuals.blocks)
+    of_cameras = free[frames, :POSE_SIZE].sum() + free[images, POSE_SIZE:].sum() + lenses.free[lens[images]].sum()
+    return int(of_cameras + 3 * points.sum() + blocks)
 
 
 def _any_of_group(group: np.ndarray, values: Bool[np.ndarray, "cameras 6"]) -> Bool[np.ndarray, "cameras 6"]:

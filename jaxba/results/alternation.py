@@ -9,6 +9,9 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
+import numpy as np
+
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import set_aside
@@ -18,7 +21,7 @@ from jaxba.solver.drivers import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
-from jaxba.solver.solve import Solution, joined, solve_without
+from jaxba.solver.solve import Solution, solve_without
 
 MAX_ROUNDS = 5
 """Most retriangulations. Source: COLMAP, ba_global_max_refinements."""
@@ -84,5 +87,20 @@ def solve_and_retriangulate(
         if not found.pays(options.tolerances.ftol):
             break
         before = solution.iterations, solution.total_s
-        solution = joined(solution, run(found.problem, options.max_iterations - solution.iterations))
+        solution = _joined(solution, run(found.problem, options.max_iterations - solution.iterations))
     return solution
+
+
+def _joined(before: Solution, last: Solution) -> Solution:
+    """The solution of two consecutive solves together."""
+    return replace(
+        last,
+        initial_cost=before.initial_cost,
+        iterations=before.iterations + last.iterations,
+        accepted=before.accepted + last.accepted,
+        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
+        setup_s=before.setup_s + last.setup_s,
+        compile_s=before.compile_s + last.compile_s,
+        total_s=before.total_s + last.total_s,
+        quick_iterations=before.quick_iterations + last.quick_iterations,
+    )

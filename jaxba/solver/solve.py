@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -19,6 +18,8 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, distance_to_end
 from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.frames import num_unknowns
+from jaxba.problem.hold import hold
 from jaxba.problem.part import observed_part
 from jaxba.problem.residuals import PIXELS
 from jaxba.runtime import process
@@ -85,6 +86,21 @@ class Solution(ArrayRecord):
     set_aside: Int[np.ndarray, " away"] = field(default_factory=lambda: np.zeros(0, int))
     """Cameras that face away from their points (problem/facing.py). Their views count in no cost, and they stay."""
 
+    lenses_free: bool = True
+    """Whether `SolveOptions.intrinsics` were."""
+
+    @property
+    def num_residuals(self) -> int:
+        """Number of residuals: two of each observation, and those of other residuals' rows."""
+        own = sum(len(rows) * rows.size for rows in self.problem.residuals.rows)
+        away = int(np.isin(self.problem.camera_index, self.set_aside).sum()) if len(self.set_aside) else 0
+        return 2 * (self.problem.num_observations - away) + own
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of parameters that were optimised, without what is constant or not observed."""
+        return num_unknowns(self.problem if self.lenses_free else hold(self.problem, lenses="all"))
+
     @property
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
@@ -121,6 +137,7 @@ class Solution(ArrayRecord):
     def _told(self) -> dict[str, str]:
         return {
             "converged" if self.converged else "not converged": self.termination.reason,
+            "size": f"{self.num_residuals} residuals, {self.num_parameters} parameters",
             "cost": f"{self.initial_cost:.6g} -> {self.final_cost:.6g}",
             "iterations": f"{self.iterations} in {self.total_s:.3g} s, compilation {self.compile_s:.3g} s",
         }
@@ -255,21 +272,7 @@ def solution_of(
         total_s=total_s,
         capacity=setup.capacity,
         set_aside=setup.away,
-    )
-
-
-def joined(before: Solution, last: Solution) -> Solution:
-    """The solution of two consecutive solves together."""
-    return replace(
-        last,
-        initial_cost=before.initial_cost,
-        iterations=before.iterations + last.iterations,
-        accepted=before.accepted + last.accepted,
-        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
-        setup_s=before.setup_s + last.setup_s,
-        compile_s=before.compile_s + last.compile_s,
-        total_s=before.total_s + last.total_s,
-        quick_iterations=before.quick_iterations + last.quick_iterations,
+        lenses_free=setup.options.intrinsics == "free",
     )
 
 

@@ -25,7 +25,7 @@ from jaxba import (
 )
 from jaxba.cli.constraints import constrained
 from jaxba.problem import geometry
-from jaxba.problem.frames import free_poses, in_frames
+from jaxba.problem.frames import num_unknowns
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
@@ -112,17 +112,6 @@ def by_colmap(
     return summary.num_effective_parameters_reduced, summary.final_cost
 
 
-def unknowns(problem: BundleProblem) -> int:
-    """Of frames, lenses, places in rigs and points that are seen, each once."""
-    here, seen = in_frames(problem), np.unique(problem.camera_index)
-    free, lens = free_poses(here), np.asarray(problem.lenses.index)
-    frame = np.arange(len(free)) if here.rigs is None else np.asarray(here.rigs.frame)
-    first = lambda group: seen[np.unique(group[seen], return_index=True)[1]]
-    held = 0 if problem.constants is None else int(problem.constants.points.sum())
-    numbers = free[first(frame), :6].sum() + free[first(lens), 6:].sum() + problem.lenses.free[lens[first(lens)]].sum()
-    return int(numbers) + 3 * (problem.num_points - held)
-
-
 def gauged(problem: BundleProblem, gauge: str, note: str | None = None) -> BundleProblem:
     """The problem with a gauge, which comes with this note."""
     if note is None:
@@ -152,7 +141,7 @@ def test_two_cameras_count_frames_that_are_held(tmp_path, cameras, held):
     problem = with_frames_held(read_colmap(folder), folder, [1, 2][:held])
     count, cost = by_colmap(folder, "two-cameras", frames=[1, 2][:held])
     found = gauged(problem, "two-cameras", NOT_NEEDED if held == 2 else None)
-    assert unknowns(found) == count
+    assert num_unknowns(found) == count
     ends_as(found, cost)
 
 
@@ -162,7 +151,7 @@ def test_two_cameras_leave_the_scale_that_constant_sensors_give(tmp_path, held):
     folder = model_of(tmp_path / "m", 2)
     problem = with_frames_held(hold(read_colmap(folder), extrinsics="all"), folder, [1][:held])
     found = gauged(problem, "two-cameras", NOT_NEEDED if held else None)
-    assert unknowns(found) == by_colmap(folder, "two-cameras", frames=[1][:held], **CONSTANT)[0] + 1
+    assert num_unknowns(found) == by_colmap(folder, "two-cameras", frames=[1][:held], **CONSTANT)[0] + 1
     ends_as(found, by_colmap(folder, **CONSTANT)[1])
 
 
@@ -174,7 +163,7 @@ def test_three_points_count_points_that_are_held(tmp_path, cameras, held):
     options, ids = CONSTANT if cameras > 1 else {}, problem.labels.points
     count, _ = by_colmap(folder, "three-points", points=ids[10 : 10 + held], **options)
     found = gauged(problem, "three-points", NOT_NEEDED if held > 2 else "more than is free" if cameras > 1 else None)
-    assert unknowns(found) == count
+    assert num_unknowns(found) == count
     ends_as(found, by_colmap(folder, points=ids[found.constants.points], **options)[1])
 
 
@@ -182,7 +171,7 @@ def test_a_single_frame_has_the_gauge_of_three_points(tmp_path):
     folder = model_of(tmp_path / "m", 2, frames=1)
     problem = read_colmap(folder)
     found = gauged(problem, "two-cameras", "the gauge holds three points")
-    assert unknowns(found) == by_colmap(folder, "two-cameras")[0]
+    assert num_unknowns(found) == by_colmap(folder, "two-cameras")[0]
     ends_as(found, by_colmap(folder, points=problem.labels.points[found.constants.points])[1])
 
 
@@ -192,9 +181,9 @@ def test_a_rig_without_a_reference_camera_is_rigid(tmp_path, make):
     with pytest.warns(ProblemWarning, match="left out"):  # images, or the IMU
         problem = read_colmap(folder)
     count, cost = by_colmap(folder)
-    assert unknowns(problem) == count
+    assert num_unknowns(problem) == count
     found = with_gauge(problem, "two-cameras")
-    assert unknowns(found) == count - 6
+    assert num_unknowns(found) == count - 6
     solved = solve(found, options=TIGHT).problem
     write_colmap(solved, tmp_path / "out", like=folder)
     with pytest.warns(ProblemWarning, match="left out"):
@@ -218,10 +207,10 @@ def test_position_priors_fix_the_gauge_as_far_as_they_can(tmp_path, measured, ga
         with pytest.warns(ProblemWarning, match="the alignment"):
             known = add()
         found = with_gauge(known, gauge)
-        assert unknowns(found) == count + 7 - (0 if gauge == "free" else {1: 4, 2: 1}[measured])
+        assert num_unknowns(found) == count + 7 - (0 if gauge == "free" else {1: 4, 2: 1}[measured])
     else:
         found = gauged(add(), gauge, NOT_NEEDED if gauge != "free" else None)
-        assert unknowns(found) == count
+        assert num_unknowns(found) == count
     ends_as(found, cost)
 
 
@@ -236,7 +225,7 @@ def test_frames_that_are_held_let_sensors_move(tmp_path, held, option):
     named = constrained(read_colmap(folder), (), None, str(tmp_path / "c.yaml"))
     np.testing.assert_array_equal(named.constants.poses, problem.constants.poses)
     count, cost = by_colmap(folder, **{option: "poses" not in held})
-    assert unknowns(problem) == count
+    assert num_unknowns(problem) == count
     ends_as(problem, cost)
 
 

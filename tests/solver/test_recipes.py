@@ -1,0 +1,36 @@
+"""Recipes side by side: each ends as it does alone, and the lowest end wins."""
+
+from __future__ import annotations
+
+import pytest
+import support
+
+import jaxba
+from jaxba.cli.solve import run
+from jaxba.solver.recipes import RECIPES
+
+
+def test_each_recipe_ends_as_it_does_alone():
+    problem = support.tiny()
+    found = jaxba.solve_recipes(problem, 2, "bold")
+    alone = [jaxba.solve(problem, policy) for policy in ("bold", RECIPES[1])]
+    assert [one.final_cost for one in found] == pytest.approx([one.final_cost for one in alone], rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, len(RECIPES) + 1])
+def test_there_are_only_so_many(count):
+    with pytest.raises(ValueError, match=f"there are 1 to {len(RECIPES)} recipes, not {count}"):
+        jaxba.solve_recipes(support.tiny(), count)
+
+
+def test_the_command_writes_the_lowest_end_and_names_all(tmp_path, capsys):
+    jaxba.write_bal(support.tiny(), tmp_path / "p.txt")
+    assert run([str(tmp_path / "p.txt"), "--recipes", "2", "--output", str(tmp_path / "s.txt")]) == 0
+    shown = capsys.readouterr().out
+    assert f"\n{RECIPES[0]}: cost " in shown
+    assert f"\n{RECIPES[1]}: cost " in shown
+    ends = [float(line.split()[2]) for line in shown.splitlines() if line.startswith(RECIPES[:2])]
+    written = jaxba.solve(jaxba.read_problem(tmp_path / "s.txt"), options=jaxba.SolveOptions(max_iterations=0))
+    assert written.initial_cost == pytest.approx(min(ends), rel=1e-5)
+    assert run([str(tmp_path / "p.txt"), "--recipes", "2", "--log", str(tmp_path / "l.json")]) == 2
+    assert "for one policy, not for --recipes" in capsys.readouterr().err
