@@ -56,6 +56,9 @@ _STDOUT = 1
 DEFAULT_SCENE = next(iter(DEFAULT_SCENES))
 """Name of the scene that is solved if no problem is given."""
 
+AXES = "rotation (radians, left perturbation), then translation; in the camera's frame y is up, and it looks along -z"
+"""What the rows of `poses` in a file of covariances are."""
+
 OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
 """Fields of options whose command-line option has another name."""
 
@@ -423,9 +426,13 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
 
     with common.notes_printed():
         found = covariance(problem, loss=loss)
+    names = ("poses", "lenses", "points", "points_given_cameras")
+    arrays = {name: getattr(found, name) for name in names} | {"axes": np.array(AXES)}
+    if (labels := problem.labels) is not None:
+        ids = {"image_names": np.array(labels.names), "image_ids": labels.images}
+        arrays |= ids | {"camera_ids": labels.lenses, "point_ids": labels.points}
     with open_output(path) as file:
-        arrays = ("poses", "lenses", "points", "points_given_cameras")
-        np.savez_compressed(file, **{name: getattr(found, name) for name in arrays})
+        np.savez_compressed(file, **arrays)
     common.print_line(f"wrote {path}")
 
 

@@ -142,6 +142,9 @@ def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_pat
     with np.load(spread) as arrays:
         assert (arrays["poses"][0] == 0).all()
         assert (arrays["poses"][1].diagonal() > 0).all()
+        assert arrays["image_names"][[0, 2]].tolist() == ["image0001.jpg", "image0003.jpg"]
+        assert arrays["point_ids"][1] == 2
+        assert "looks along -z" in str(arrays["axes"])
 
 
 NAMES = ("000010", "1_000", "0x10", "1e3", "yes", "2024-01-01")

@@ -390,6 +390,18 @@ def test_a_text_model_beside_a_binary_one_is_written_as_that(tmp_path):
     np.testing.assert_allclose(read_problem(binary).points, moved.points, rtol=1e-15)
 
 
+def test_both_forms_of_a_folder_are_written_and_none_is_left_old(tmp_path):
+    """nerfstudio reads the text files first, COLMAP the binary ones."""
+    folder = write(model_of(["RADIAL"]), tmp_path / "m")
+    write(model_of(["RADIAL"]), tmp_path / "m", text=True)
+    problem = read_problem(folder)
+    moved = problem.replace(points=problem.points + 1)
+    write_colmap(moved, folder, like=folder)
+    for file in folder.glob("*.bin"):
+        file.rename(tmp_path / file.name)
+    np.testing.assert_allclose(read_problem(folder).points, moved.points, rtol=1e-15)
+
+
 def rigs_of(cameras: int):
     """Two rigs of cameras that see 60 points in five frames each, with noise."""
     pycolmap.set_random_seed(0)

@@ -57,13 +57,15 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
 
 
 def write_model(model: Model, folder: StrPath, suffix: str) -> None:
-    """Writes the files of a model with rigs and frames, `.bin` or `.txt` by the suffix: all to a hidden folder, then
-    each replaces the old one. It may not exist yet. Raises ProblemError: the folder cannot be written."""
+    """Writes the files of a model with rigs and frames, `.bin` or `.txt` by the suffix, and both where the folder has
+    the other ones, too, which some programs read first: all to a hidden folder, then each replaces the old one. It may
+    not exist yet. Raises ProblemError: the folder cannot be written."""
     target = Path(folder)
+    forms = [form for form in _FORMS if form == suffix or has_parts(folder, form)]
     beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
     try:
         with tempfile.TemporaryDirectory(dir=beside, prefix=".jaxba-") as temporary:
-            for name, content in _FORMS[suffix].encode(model):
+            for name, content in (file for form in forms for file in _FORMS[form].encode(model)):
                 (Path(temporary) / name).write_bytes(content)
             target.mkdir(exist_ok=True)
             for file in sorted(Path(temporary).iterdir()):
