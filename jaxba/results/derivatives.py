@@ -16,6 +16,7 @@ Implicit Differentiation".
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,26 +27,29 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.linear.reduced_system import solve_reduced
 from jaxba.linear.schur import DampedSystem, back_substitute, lift_to_cameras
-from jaxba.lm.step import initial_state
+from jaxba.lm.records import LMState
+from jaxba.lm.step import state_of
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import facing_away
-from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, free_directions
+from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, fixed_freedoms, free_directions
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.rotations import compose_left, rotation_matrix
 from jaxba.runtime.jit import jit
-from jaxba.runtime.numerics import check_x64, numerics, refuse_traces
+from jaxba.runtime.numerics import check_x64, numerics
+from jaxba.solver.loop import solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import check_problem
-from jaxba.solver.prepare import DEFAULT_POLICY, set_up
+from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.solve import solve
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take
@@ -96,8 +100,10 @@ def differentiable_solve(
 ) -> Callable[[SolveInputs], tuple[Float[Array, "cameras parameters"], Float[Array, "points 3"]]]:
     """A solve as a function with derivatives: from `SolveInputs` to the cameras and points at the minimum.
 
-    Reverse mode (`jax.grad`, `jax.vjp`) works, and not inside `jax.jit`, since the solve runs from Python. 64 bits must
-    be enabled in JAX. The start is that of the inputs, and the minimum that it leads to counts as a function of them.
+    Reverse mode works (`jax.grad`, `jax.vjp`, `jax.jacrev`). Inside `jax.jit` and `jax.vmap` the solve is the compiled
+    loop of `jaxba.solve_loop`, where which images face away is that of the problem; outside it is `solve`, which
+    compiles in less time. 64 bits must be enabled in JAX. The start is that of the inputs, and the minimum that it
+    leads to counts as a function of them.
 
     A free gauge leaves an orbit of minima, and a point that is seen once a ray of them. The derivative is that of the
     minimum that moves at right angles to these (in radians and scene units). What is the same on all of an orbit, as
@@ -107,25 +113,36 @@ def differentiable_solve(
     The problem says everything that the inputs do not: who sees what, lenses, constants, priors, rigs. `policy` and
     `options` are as for `solve`. Tolerances should be tight: the theorem holds at a minimum. Derivatives of the
     returned function raise a ProblemError if conjugate gradients do not solve with the Hessian, as where more than
-    gauge and depths of points is not determined."""
+    gauge and depths of points is not determined; inside `jax.jit` and `jax.vmap` they are NaN then."""
     check_problem(problem)
     options = checked_options(options)
+
+    @functools.cache
+    def prepared() -> _Prepared:
+        with jax.ensure_compile_time_eval():  # a trace may be what asks for it
+            fixed = bool(problem.residuals) and fixed_freedoms(problem) == SIMILARITY
+            return _Prepared.of(problem, policy, options, facing_away(problem))._replace(fixed=fixed)
 
     @jax.custom_vjp
     def find(inputs: SolveInputs) -> tuple[Array, Array]:
         return forward(inputs)[0]
 
-    def forward(inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, BundleProblem]]:
-        refuse_traces(inputs)
+    def forward(inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, Any]]:
         check_x64(np.float64)
+        if _traced(inputs):
+            return prepared().solved(inputs)
         with numerics(np.float64):
             solved = solve(_with_inputs(problem, inputs), policy, options).problem
             return (jnp.asarray(solved.cameras), jnp.asarray(solved.points)), (inputs, solved)
 
-    def backward(saved: tuple[SolveInputs, BundleProblem], cotangents: tuple[Array, Array]) -> tuple[SolveInputs]:
-        inputs, solved = saved
+    def backward(saved: tuple[SolveInputs, Any], cotangents: tuple[Array, Array]) -> tuple[SolveInputs]:
+        inputs, end = saved
+        if not isinstance(end, BundleProblem):
+            return (prepared().transposed(inputs, *end, cotangents),)
         with numerics(np.float64):
-            return (_transposed(solved, policy, options, inputs, cotangents),)
+            at = _Prepared.of(end, policy, options, facing_away(_with_inputs(end, inputs)))
+            here, symmetries = at.setup.placed.here, _symmetries(at.setup.placed.counted, at.setup.layout)
+            return (at.transposed(inputs, here.cameras, here.points, cotangents, symmetries),)
 
     find.defvjp(forward, backward)
     return find
@@ -144,42 +161,92 @@ def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
     )
 
 
-def _transposed(
-    solved: BundleProblem,
-    policy: str | DampingPolicy,
-    options: SolveOptions,
-    inputs: SolveInputs,
-    cotangents: tuple[Array, Array],
-) -> SolveInputs:
-    """Cotangents of the inputs for those of the solution."""
-    options, away = replace(options, pad=False, devices=1), facing_away(_with_inputs(solved, inputs))
-    setup = set_up(solved, policy, replace(options, dtype="float64"), away)
-    step = replace(
-        setup.options,
-        coordinates=replace(setup.options.coordinates, rotation="manifold"),
-        conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-10),
-    )
-    counted, offset, here = setup.placed
-    if offset.any():
-        raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
-    kept = np.flatnonzero(~np.isin(solved.camera_index, away))  # observations that count
-    with numerics(np.float64):
-        rest = np.zeros(len(here.camera_index) - len(kept) + 1, int)  # those that stand for other residuals, and none
-        slots = jnp.asarray(np.append(kept, rest)[setup.layout.observation])
-        arguments = (setup.layout, slots, here, *_symmetries(counted, setup.layout), inputs, cotangents)
+def _traced(tree: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+class _Prepared(NamedTuple):
+    """A problem for derivatives."""
+
+    setup: Setup
+    slots: Int[np.ndarray, "..."]  # which observation is in which slot of the layout
+    options: SolveOptions
+    fixed: bool = False  # whether residuals and constants are known to fix the gauge
+
+    @classmethod
+    def of(
+        cls, problem: BundleProblem, policy: str | DampingPolicy, options: SolveOptions, away: Int[np.ndarray, " away"]
+    ) -> _Prepared:
+        """`away`: cameras whose views do not count."""
+        setup = set_up(problem, policy, replace(options, pad=False, devices=1, dtype="float64"), away)
+        if setup.placed.offset.any():
+            raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
+        kept = np.flatnonzero(~np.isin(problem.camera_index, away))  # observations that count
+        here = setup.placed.here.camera_index
+        rest = np.zeros(len(here) - len(kept) + 1, int)  # those that stand for other residuals, and none
+        return cls(setup, np.append(kept, rest)[setup.layout.observation], options)
+
+    def solved(self, inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, tuple[Array, Array]]]:
+        """The solution inside a transformation of JAX, and what `transposed` takes."""
+        setup, (cameras, points) = self.setup, self.setup.start
+        model = _Model.of(setup.layout, self.slots, cameras, inputs.points, inputs)
+        layout, limit = model.with_data(inputs), self.options.max_iterations
+        start = state_of(layout, model.of_frames(inputs.cameras), inputs.points, setup.options, jnp.float64)
+        end = solve_loop(layout, start, setup.policy, self.options.tolerances, setup.options, limit)[0].state
+        points = jnp.asarray(inputs.points).at[layout.points].set(end.points.T, mode="drop")
+        return (model.as_given(end.cameras).T, points), (inputs, (end.cameras.T, points))
+
+    def symmetries(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+        """`_symmetries` inside a transformation of JAX."""
+        setup = self.setup
+        if setup.problem.residuals and not self.fixed:
+            raise ProblemError("inside jax.jit and jax.vmap a problem with other residuals needs a fixed gauge")
+
+        def host(cameras: Array, points: Array) -> tuple[np.ndarray, np.ndarray]:
+            order = np.minimum(np.asarray(setup.layout.points), len(points) - 1)
+            state = LMState(np.asarray(cameras).T, np.asarray(points).T[:, order], np.zeros(()))
+            solved = setup.placed.after(setup.layout, setup.layout.points, state, setup.options)
+            return _symmetries(solved, setup.layout, fixed=self.fixed)
+
+        width = setup.layout.unknowns.width
+        numbers = setup.layout.num_cameras * width + 3 * len(setup.layout.points)
+        shapes = (SIMILARITY, numbers), (len(setup.layout.points), 3, 3)
+        found = tuple(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes)
+        return jax.pure_callback(host, found, cameras, points, vmap_method="sequential")
+
+    def transposed(
+        self,
+        inputs: SolveInputs,
+        cameras: AnyArray,
+        points: AnyArray,
+        cotangents: tuple[Array, Array],
+        symmetries: Any = None,
+    ) -> SolveInputs:
+        """Cotangents of the inputs for those of the solution, which has these parameters where it is computed."""
+        step = replace(
+            self.setup.options,
+            coordinates=replace(self.setup.options.coordinates, rotation="manifold"),
+            conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-10),
+        )
+        layout, slots = self.setup.layout, jnp.asarray(self.slots)
+        symmetries = self.symmetries(cameras, points) if symmetries is None else symmetries
+        arguments = (layout, slots, cameras, points, *symmetries, inputs, cotangents)
         found, residual = jit(_solve_transposed, once=True, static_argnames="options")(*arguments, options=step)
-    if not float(residual) < LARGEST_RESIDUAL:
-        raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
-    return found
+        if _traced(residual):
+            return jax.tree.map(lambda x: jnp.where(residual < LARGEST_RESIDUAL, x, jnp.nan), found)
+        if not float(residual) < LARGEST_RESIDUAL:
+            raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
+        return found
 
 
 def _symmetries(
-    solved: BundleProblem, layout: Layout
+    solved: BundleProblem, layout: Layout, *, fixed: bool = False
 ) -> tuple[Float[np.ndarray, "7 numbers"], Float[np.ndarray, "points 3 3"]]:
     """What leaves the cost as it is: an orthonormal basis of seven directions of the gauge, zero for those that are not
-    free, in all numbers of cameras and points; and the directions in which rays determine points, in layout order."""
+    free, in all numbers of cameras and points; and the directions in which rays determine points, in layout order.
+    `fixed`: it is known that none is free."""
     order, determined = np.asarray(layout.points), determined_directions(solved)
-    cameras, points = free_directions(solved)
+    cameras, points = free_directions(solved.replace(residuals=Residuals()) if fixed else solved)
     more = layout.num_cameras - solved.num_cameras
     cameras = np.pad(cameras, ((0, 0), (0, more), (0, sum(layout.unknowns.own_sizes))))
     cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
@@ -190,14 +257,78 @@ def _symmetries(
     whole = np.hstack([x.reshape(len(x), math.prod(x.shape[1:])) for x in (cameras, points)])
     _, sizes, rows = np.linalg.svd(whole, full_matrices=False)
     basis = np.zeros((SIMILARITY, whole.shape[1]))
-    basis[: len(whole)] = np.where((sizes > RESOLVED * sizes.max(initial=0.0))[:, None], rows, 0.0)
+    moves = sizes > RESOLVED * sizes.max(initial=0.0)
+    basis[: len(whole)] = np.where(moves[:, None] & (not fixed), rows, 0.0)
     return basis, np.where(real[:, None, None], determined[at], 0.0)
+
+
+class _Model(NamedTuple):
+    """Parameters where a problem is computed, as functions of steps of the unknowns and of the inputs."""
+
+    layout: Layout
+    slots: AnyArray
+    cameras: Array  # as in a state
+    points: Array
+    given: int  # cameras of the inputs; others stand for rows of residuals
+    real: int  # points of the problem; others pad
+
+    @classmethod
+    def of(cls, layout: Layout, slots: AnyArray, cameras: AnyArray, points: AnyArray, inputs: SolveInputs) -> _Model:
+        """Of parameters as `Placed.here` has them."""
+        found = jnp.asarray(points).at[layout.points].get(mode="fill", fill_value=0).T
+        return cls(layout, jnp.asarray(slots), jnp.asarray(cameras).T, found, len(inputs.cameras), len(points))
+
+    @property
+    def zero(self) -> tuple[Array, Array]:
+        """No step."""
+        return jnp.zeros((self.cameras.shape[1], self.layout.unknowns.width)), jnp.zeros_like(self.points)
+
+    @property
+    def end(self) -> int:
+        """Where the blocks of residuals begin."""
+        return len(self.cameras) - sum(self.layout.unknowns.own_sizes)
+
+    def with_data(self, theta: SolveInputs) -> Layout:
+        """The layout with what the inputs measured."""
+        in_slots = lambda x: jnp.where(self.layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., self.slots], 0)
+        here = replace(self.layout, pixels=in_slots(theta.observations))
+        if theta.whitening is not None:
+            here = replace(here, whitening=in_slots(theta.whitening))
+        own = zip(here.residuals, theta.residuals, strict=True)
+        return replace(here, residuals=tuple(replace(x, rows=replace(x.rows, data=data)) for x, data in own))
+
+    def of_frames(self, cameras: AnyArray) -> Array:
+        """Cameras as the inputs have them, as those of the state."""
+        state, end = self.cameras, self.end
+        cameras = jnp.concatenate([cameras, state[: cameras.shape[1], len(cameras) :].T])
+        if not self.layout.unknowns.in_rigs:
+            return jnp.concatenate([cameras, state[end:].T], axis=1)
+        place = state[end - EXTRINSICS_SIZE : end]
+        turn, rows = rotation_matrix(place[:3]), jnp.asarray(cameras).T
+        moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
+        return jnp.concatenate([compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place, state[end:]]).T
+
+    def moved(self, y: tuple[Array, Array], theta: SolveInputs, determined: Array) -> tuple[Array, Array]:
+        """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
+        unknowns = self.layout.unknowns
+        cameras = self.cameras + _start_of_constants(self.layout, self.of_frames(theta.cameras))
+        points = self.points + _start_of_points(self.real, determined, jnp.asarray(theta.points), self.layout.points)
+        return camera.moved(cameras, unknowns.expanded(y[0].T), unknowns), points + y[1]
+
+    def as_given(self, cameras: Array) -> Array:
+        """Cameras of a state as the solution has them."""
+        unknowns = self.layout.unknowns
+        if not unknowns.in_rigs:
+            return cameras[: self.end, : self.given]
+        own = cameras[POSE_SIZE : self.end - EXTRINSICS_SIZE]
+        return jnp.concatenate([*camera.poses(cameras, unknowns), own])[:, : self.given]
 
 
 def _solve_transposed(
     layout: Layout,
     slots: Array,
-    solved: BundleProblem,
+    cameras: AnyArray,
+    points: AnyArray,
     gauge: Float[Array, "7 numbers"],
     determined: Float[Array, "points 3 3"],
     inputs: SolveInputs,
@@ -205,11 +336,9 @@ def _solve_transposed(
     *,
     options: StepOptions,
 ) -> tuple[SolveInputs, Array]:
-    state = initial_state(layout, solved, options, jnp.float64)
-    unknowns, order = layout.unknowns, layout.points
-    count, end = state.cameras.shape[1], len(state.cameras) - sum(unknowns.own_sizes)
-    given = len(inputs.cameras)
-    seen = jnp.asarray(layout.camera_seen)[:, None] & (jnp.arange(count)[:, None] < given)  # others stand for rows
+    model = _Model.of(layout, slots, cameras, points, inputs)
+    unknowns, order, zero = layout.unknowns, layout.points, model.zero
+    seen = jnp.asarray(layout.camera_seen)[:, None] & (jnp.arange(len(zero[0]))[:, None] < model.given)
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
         """On the unknowns that a minimum determines, orthogonally."""
@@ -219,59 +348,29 @@ def _solve_transposed(
         along = jnp.matmul(gauge, flat, precision="highest")
         return unravel(flat - jnp.matmul(along, gauge, precision="highest"))
 
-    def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
-        """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
-        cameras = state.cameras + _start_of_constants(layout, of_frames(theta.cameras))
-        points = state.points + _start_of_points(solved, determined, jnp.asarray(theta.points), order)
-        return camera.moved(cameras, unknowns.expanded(y[0].T), unknowns), points + y[1]
-
-    def of_frames(cameras: AnyArray) -> Array:
-        """Cameras as the inputs have them, as those of the state."""
-        cameras = jnp.concatenate([cameras, state.cameras[: cameras.shape[1], len(cameras) :].T])
-        if not unknowns.in_rigs:
-            return jnp.concatenate([cameras, state.cameras[end:].T], axis=1)
-        place = state.cameras[end - EXTRINSICS_SIZE : end]
-        turn, rows = rotation_matrix(place[:3]), jnp.asarray(cameras).T
-        moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
-        return jnp.concatenate(
-            [compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place, state.cameras[end:]]
-        ).T
-
     def found(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters as the solution has them."""
-        cameras, points = moved(y, theta)
-        if not unknowns.in_rigs:
-            return cameras[:end, :given], points
-        own = cameras[POSE_SIZE : end - EXTRINSICS_SIZE]
-        return jnp.concatenate([*camera.poses(cameras, unknowns), own])[:, :given], points
+        cameras, points = model.moved(y, theta, determined)
+        return model.as_given(cameras), points
 
-    def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
-        in_slots = lambda x: jnp.where(layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., slots], 0)
-        here = replace(layout, pixels=in_slots(theta.observations))
-        if theta.whitening is not None:
-            here = replace(here, whitening=in_slots(theta.whitening))
-        own = zip(layout.residuals, theta.residuals, strict=True)
-        here = replace(here, residuals=tuple(replace(x, rows=replace(x.rows, data=data)) for x, data in own))
-        return cost(here, *moved(y, theta), options.loss)
-
-    zero = jnp.zeros((count, unknowns.width)), jnp.zeros_like(state.points)
     # the cotangents in the unknowns
     _, pull = jax.vjp(lambda y: found(y, inputs), zero)
-    of_points = jnp.where(order < solved.num_points, 1.0, 0.0)
-    by_points = of_points * cotangents[1].T[:, jnp.minimum(order, solved.num_points - 1)]
+    of_points = jnp.where(order < model.real, 1.0, 0.0)
+    by_points = of_points * cotangents[1].T[:, jnp.minimum(order, model.real - 1)]
     size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
     (whole,) = pull((cotangents[0].T, by_points))
     right, whole = project(whole), size(whole)  # where all of it is along the orbit, what is left is rounding
 
     def along(y: tuple[Array, Array], theta: SolveInputs, step: tuple[Array, Array]) -> Array:
         """The slope of the cost along a step. Its gradient by y is H step, and by theta step . dg/dtheta."""
-        return jax.jvp(lambda y: objective(y, theta), (y,), (step,))[1]
+        objective = lambda y: cost(model.with_data(theta), *model.moved(y, theta, determined), options.loss)
+        return jax.jvp(objective, (y,), (step,))[1]
 
     def product(y: tuple[Array, Array]) -> tuple[tuple[Array, Array], SolveInputs]:
         image, by_theta = jax.grad(along, argnums=(0, 1))(zero, inputs, project(y))
         return project(image), by_theta
 
-    inverse = _gauss_newton(layout, state.cameras, state.points, options)
+    inverse = _gauss_newton(model.with_data(inputs), model.cameras, model.points, options)
     tolerance = TOLERANCE * whole
     preconditioner = lambda y: project(inverse(project(y)))
     left, through = _conjugate_gradients(product, right, preconditioner, tolerance, inputs)
@@ -325,9 +424,9 @@ def _start_of_constants(layout: Layout, cameras: Array) -> Array:
     return (kept - jax.lax.stop_gradient(kept)).T
 
 
-def _start_of_points(solved: BundleProblem, determined: Array, points: Array, order: AnyArray) -> Array:
+def _start_of_points(real: int, determined: Array, points: Array, order: AnyArray) -> Array:
     """The same for points that are constant or that nothing sees, in layout order."""
-    own = points.T[:, jnp.minimum(order, solved.num_points - 1)]
+    own = points.T[:, jnp.minimum(order, real - 1)]
     kept = jnp.where(jnp.any(determined != 0, axis=(1, 2)), 0, own)
     return kept - jax.lax.stop_gradient(kept)
 

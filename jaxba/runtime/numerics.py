@@ -17,7 +17,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 TRACED = (
     "JAX traces this call (jit, vmap or grad), which is for NumPy problems outside of traces: in jit and vmap use "
-    "jaxba.solve_loop with what jaxba.prepare returned before, for gradients jaxba.differentiable_solve, not in jit"
+    "jaxba.solve_loop with what jaxba.prepare returned before, for gradients jaxba.differentiable_solve"
 )
 """What is said where JAX traces a function that needs NumPy arrays."""
 

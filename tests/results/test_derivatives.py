@@ -37,6 +37,25 @@ def constrained() -> jaxba.BundleProblem:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("make", [scene, constrained], ids=["free gauge", "constants and priors"])
+def test_compiled_and_mapped_derivatives_are_those_of_single_solves(make):
+    problem, rng = make(), np.random.default_rng(2)
+    inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
+    solved = differentiable_solve(problem, "ceres", TIGHT)
+    lenses = rng.normal(size=(6, 3)) * [1e-3, 1, 1]  # they are the same on an orbit of a free gauge
+    value = lambda pixels: jnp.sum(lenses * solved(inputs._replace(observations=pixels))[0][:, 6:])
+    pixels = inputs.observations + 0.1 * rng.normal(size=(3, *inputs.observations.shape))
+    found = jax.jit(jax.vmap(jax.value_and_grad(value)))(pixels)
+    for number, one in enumerate(pixels):
+        cost, gradient = jax.value_and_grad(value)(one)
+        assert found[0][number] == pytest.approx(float(cost), rel=1e-6)
+        np.testing.assert_allclose(found[1][number], gradient, atol=1e-5 * float(jnp.abs(gradient).max()))
+    rows = jax.jacrev(lambda pixels: solved(inputs._replace(observations=pixels))[0][:2, 6])(pixels[0])
+    one = jax.grad(lambda pixels: solved(inputs._replace(observations=pixels))[0][1, 6])(pixels[0])
+    np.testing.assert_allclose(rows[1], one, atol=1e-6 * float(jnp.abs(one).max()))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
 def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_differences(linear_solver):
     problem, rng = constrained(), np.random.default_rng(1)
