@@ -65,13 +65,6 @@ def windows(
     for first in (*range(0, cameras - size, stride), cameras - size):
         keep = (camera_index >= first) & (camera_index < first + size)
         keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
-        names, renumbered = np.unique(point_index[keep], return_inverse=True)
-        part = BundleProblem.create(
-            np.asarray(problem.cameras)[first : first + size],
-            np.asarray(problem.points)[names],
-            np.asarray(problem.observations)[keep],
-            camera_index[keep] - first,
-            renumbered,
-        )
+        part = problem.subset(keep, np.arange(first, first + size), np.unique(point_index[keep]))
         found.append((part, frames[first : first + size]))
     return found
