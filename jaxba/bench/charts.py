@@ -63,17 +63,8 @@ def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
 
 
 def line(name: str, x: Values, y: Values, style: Style, *, label: str = "", marked: bool = True, **own: Any) -> Chart:
-    """The trace of a line.
-
-    Args:
-        name: solver or policy whose line it is.
-        x: places of its points.
-        y: their heights.
-        style: of the solver.
-        label: what the line is called, `name` if empty.
-        marked: whether it has markers.
-        own: further keys of the trace.
-    """
+    """The trace of a solver's or policy's line through points, with markers if `marked`. `label` is what it is called,
+    if not by its name; `own` are further keys."""
     marker = {"symbol": style.symbol, "size": 6, "color": style.color, "maxdisplayed": 14}
     how = {"mode": "lines+markers", "marker": marker} if marked else {"mode": "lines"}
     drawn = {"line": {"color": style.color, "dash": style.dash}, "hovertemplate": _POINT, **how, **own}
@@ -105,17 +96,9 @@ def chart(
     note: str = "",
     height: int = 400,
 ) -> Chart:
-    """A chart. Lines get thinner one by one, so that of equal ones all are seen.
-
-    Args:
-        title: above it.
-        traces: its lines.
-        x: the x axis of every position of the switch.
-        y: the y axis.
-        dashed: heights of dashed lines by their label.
-        note: below it.
-        height: pixels.
-    """
+    """A chart of lines, which get thinner one by one, so that of equal ones all are seen. `x` has an axis for every
+    position of the switch, `dashed` the heights of dashed lines by their labels; the note stands below, and the height
+    is in pixels."""
     count = max(len(traces) - 1, 1)
     thick = [
         {**one["line"], "width": one["line"].get("width", 1.5 + 2 * (1 - k / count))} for k, one in enumerate(traces)
@@ -180,18 +163,11 @@ def profile_chart(records: Sequence[Record], target: Target, styles: Mapping[str
 def problem_charts(
     records: Sequence[Record], problem: str, tolerance: float, styles: Mapping[str, Style]
 ) -> list[Chart]:
-    """Accepted cost, distance to the best cost, and lambda on one problem.
+    """Accepted cost, distance to the best cost, and lambda on one problem, by the records of all.
 
     The cost has dashed lines at `f* + tau (f0 - f*)` for the paper's tolerances and the given one; the distance,
     `f - f*` over f* (over f0 for zero-residual problems), at the relative tolerances. Distances far below the lowest
-    line are drawn at the bottom. The repeat of median time is drawn.
-
-    Args:
-        records: of any problems.
-        problem: name of one of them.
-        tolerance: tau of a dashed line.
-        styles: of the solvers.
-    """
+    line are drawn at the bottom. The repeat of median time is drawn."""
     runs = representatives(records, problem)
     ends = [end for end in map(_end, runs.values()) if 0 < end < math.inf]
     log = bool(ends) and max(ends) / min(ends) > LOG_TIME_SPREAD

@@ -25,21 +25,11 @@ def write_all(
     *,
     metadata: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Writes `summary.json` and `report.html` into a folder and returns their paths.
+    """Writes `summary.json` and `report.html` into a folder, which it creates, over what is there; returns their paths.
 
-    Existing files are replaced.
-
-    Args:
-        records: at least one.
-        out_dir: folder; created if it does not exist.
-        tolerance: tau of the performance profile, in (0, 1).
-        metadata: device, threads, versions and the like, shown on top; from the records by default. That of the name
-            `command` is shown as code.
-
-    Raises:
-        ProblemError: there are no records, or the tolerance is outside (0, 1).
-        OSError: a file cannot be written.
-    """
+    `tolerance` is tau of the performance profile; `metadata`, by default from the records, is shown on top: device,
+    threads, versions and the like, and as code what has the name `command`. Raises ProblemError: there are no records,
+    or the tolerance is outside (0, 1). Raises OSError: a file cannot be written."""
     if not records:
         raise ProblemError("there are no results to report")
     if not 0 < tolerance < 1:

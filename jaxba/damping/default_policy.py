@@ -75,13 +75,8 @@ class Rescue(NamedTuple):
         return self.growth > 0
 
     def after(self, step: StepInfo, patience: int, most: int) -> tuple[Rescue, Float[Array, ""]]:
-        """The state after a step, and log10 of the next lambda in case that it is in charge.
-
-        Args:
-            step: the iteration.
-            patience: rejections in a row after which it takes over.
-            most: rejections in all after which it takes over.
-        """
+        """The state after a step, and log10 of the next lambda in case that it is in charge: after `patience`
+        rejections in a row, or `most` in all, it takes over."""
         rule, dtype, accepted = Ceres(), self.worked.dtype, step.accepted
         decades = jnp.log10(step.damping).astype(dtype)
         worked = jnp.where(accepted, decades, self.worked).astype(dtype)

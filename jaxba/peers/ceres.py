@@ -136,16 +136,9 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
 
 
 def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str, **known: Any) -> StepInfo:
-    """Converts an iteration summary of Ceres into a `StepInfo`.
-
-    Args:
-        now: summary of the iteration.
-        before: summary of the iteration before it, which has the gradient at the start of the step.
-        previous_cost: last accepted cost; the summary of a rejected step has the candidate's cost only.
-        damping: lambda that the step used.
-        mode: mode of the linear solver; only the iterative one counts conjugate gradient iterations.
-        known: fields that Ceres does not report.
-    """
+    """Converts Ceres' summaries of an iteration and of the one before it, which has the gradient at the start of the
+    step, into a `StepInfo`. Of a rejected step they have the candidate's cost only, so the last accepted one is given,
+    and lambda. Only the iterative mode counts conjugate gradients. `known` are fields that Ceres does not report."""
     fields = {
         "previous_cost": previous_cost,
         "gradient_max": before.gradient_max_norm,

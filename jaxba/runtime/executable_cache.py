@@ -86,14 +86,10 @@ class ExecutableCache:
         return stored
 
     def save(self, path: Path | None, compiled: jax.stages.Compiled, out: Any) -> None:
-        """Writes a program, whole or not at all; does nothing if it cannot be written.
+        """Writes a program to the path of `path_for`, whole or not at all; does nothing if it cannot be written.
 
-        Args:
-            path: what `path_for` returned.
-            compiled: compiled in this process (`watch_compilation`): a program that JAX has read from its own cache is
-                serialised without some of its functions.
-            out: shapes and types of its results.
-        """
+        It must be compiled in this process (`watch_compilation`): one that JAX has read from its own cache is
+        serialised without some of its functions. `out` are shapes and types of its results."""
         if path is None:
             return
         try:
