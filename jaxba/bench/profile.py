@@ -159,18 +159,14 @@ def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str
     for r in records:
         item = reach(r, target, starts[r.problem], bests[r.problem])
         found.setdefault(r.solver, {}).setdefault(r.problem, []).append(item)
-    return {solver: {name: _median_reach(items) for name, items in row.items()} for solver, row in found.items()}
+    median = lambda items: Reached(*(float(statistics.median(values)) for values in zip(*items, strict=True)))
+    return {solver: {name: median(items) for name, items in row.items()} for solver, row in found.items()}
 
 
 def reached(row: Mapping[str, Reached], names: Sequence[str]) -> Reached:
     """A row of `reach_table` as arrays over problems; a problem that was not run counts as not reached."""
     found = [row.get(name, NEVER) for name in names]
     return Reached(np.array([r.iterations for r in found]), np.array([r.seconds for r in found]))
-
-
-def _median_reach(items: Sequence[Reached]) -> Reached:
-    iterations = statistics.median(item.iterations for item in items)
-    return Reached(float(iterations), float(statistics.median(item.seconds for item in items)))
 
 
 Curve: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]

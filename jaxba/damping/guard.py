@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.default_policy import Rescue, is_inexact, smallest_decades, times_shortened
@@ -54,15 +54,11 @@ def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> Guar
     damping, failures = jnp.log10(step.damping), jnp.where(step.accepted, times_shortened(step), 1.0)
     lowest = jnp.where(is_inexact(step), damping, damping - config.descent)
     lowest = jnp.where(failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest)
-    highest = jnp.where(_is_overdamped(step), damping - 1, UNLIMITED)
-    decided = lambda limit: jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
-    return GuardState(decided(lowest), decided(highest), rescue)
-
-
-def _is_overdamped(step: StepInfo) -> Bool[Array, ""]:
     decrease = (step.previous_cost - step.cost) / step.previous_cost
     weak = (decrease < OVERDAMPED_DECREASE) & (step.damping_fraction > OVERDAMPED_FRACTION)
-    return step.accepted & (step.step_fraction == 1) & weak
+    highest = jnp.where(step.accepted & (step.step_fraction == 1) & weak, damping - 1, UNLIMITED)
+    decided = lambda limit: jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
+    return GuardState(decided(lowest), decided(highest), rescue)
 
 
 def action_of(config: AgentConfig, decades: Float[Array, ""]) -> Float[Array, ""]:

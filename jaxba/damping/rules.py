@@ -59,10 +59,6 @@ class Ceres:
         """Factor on lambda after a step with this gain ratio, or after a rejected one, whose factor is `growth`."""
         return jnp.where(accepted, jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling), growth)
 
-    def growth_after(self, rejections: Int[Array, ""]) -> Float[Array, ""]:
-        """Factor after a number of rejections in a row, at least one."""
-        return self.reject_growth * 2.0 ** (rejections - 1)
-
     def init(self, info: ProblemInfo) -> tuple[Array, Array]:
         """See `DampingPolicy`. The state is the factor after the next rejection."""
         damping = _scalar(self.initial * (1 + self.relative * (info.unit - 1)), info)

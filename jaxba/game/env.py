@@ -272,7 +272,7 @@ class Game:
 def _rule_damping(memory: Memory) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
     rule, rejections = Ceres(), memory.guard.rescue.in_a_row
-    factor = rule.factor(rejections == 0, memory.gain, rule.growth_after(rejections))
+    factor = rule.factor(rejections == 0, memory.gain, rule.reject_growth * 2.0 ** (rejections - 1))
     return memory.damping + jnp.where(memory.iteration == 0, 0.0, jnp.log10(factor))
 
 

@@ -31,11 +31,8 @@ def fusion_barrier(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
     observation. On a CPU `optimization_barrier` is dropped before fusion, so there an exact product with the unit
     matrix stands in for it: products are never fused. A non-finite entry spoils its column.
     """
-    return lax.platform_dependent(rows, cpu=_times_identity, default=lax.optimization_barrier)
-
-
-def _times_identity(rows: Array) -> Array:
-    return jnp.matmul(jnp.eye(rows.shape[0], dtype=rows.dtype), rows, precision="highest")
+    times_identity = lambda rows: jnp.matmul(jnp.eye(len(rows), dtype=rows.dtype), rows, precision="highest")
+    return lax.platform_dependent(rows, cpu=times_identity, default=lax.optimization_barrier)
 
 
 def compute_unfused(function: Callable[..., Result], *operands: Array, index: Int[AnyArray, "..."]) -> Result:

@@ -172,17 +172,12 @@ class _Run:
         if checkpoint.steps(self.folder):
             self._restore_latest(like)
         else:
-            self._begin(like)
+            fresh = start_agents(config.sac, config.loop, env, _keys(config))
+            self.state: LoopState = checkpoint.unpack(checkpoint.pack(fresh), like)  # laid out as after a checkpoint
         evaluate(_agent(self.state.learner.actor, 0))  # compiles its programs
         self._compiled = loop.result()
         self.log = Log(folder, self.chunk, hooks.note)
         hooks.stage("training")
-
-    def _begin(self, like: Any) -> None:
-        fresh = start_agents(self.config.sac, self.config.loop, self.env, _keys(self.config))
-        self.state: LoopState = checkpoint.unpack(
-            checkpoint.pack(fresh), like
-        )  # the same memory layout as after a checkpoint
 
     def _restore_latest(self, like: Any) -> None:
         """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
@@ -240,8 +235,7 @@ class _Run:
                 return Outcome(False, self.best, self.state)
         if self.evaluated != self.chunk:  # `chunks` was larger when the run began
             self.hooks.stage("evaluating the last policies")
-            actors = self._actors()
-            self._evaluate(actors)
+            self._evaluate(self._actors())
         return Outcome(True, self.best, self.state)
 
     def _actors(self) -> list[Any]:
@@ -275,17 +269,11 @@ class _Run:
             row: Row = {"seed": k, "chunk": self.chunk, "env_steps": int(counts[0][k]), "updates": int(counts[1][k])}
             rows.append({**row, **clocks, **{name: float(value[k]) for name, value in means.items()}})
         due = self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks
-        actors = self._actors() if due else []
-        return self._report(rows, actors)
-
-    def _report(self, rows: list[Row], actors: list[Any]) -> bool:
-        """Writes the rows of a chunk, with the scores of the policies if there are any. Whether the run is to end."""
-        if actors:
+        if due:
             wall = time.perf_counter()
-            for row, scores in zip(rows, self._evaluate(actors), strict=True):
-                row |= scores
-            seconds = time.perf_counter() - wall
-            rows = [{**row, "evaluate_s": seconds} for row in rows]
+            scored = self._evaluate(self._actors())
+            clocks = {"evaluate_s": time.perf_counter() - wall}
+            rows = [{**row, **scores, **clocks} for row, scores in zip(rows, scored, strict=True)]
         self.hooks.rows([self.log.write(row) for row in rows])
         return self.hooks.stop()
 
