@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from jaxba.damping import Schedule
 from jaxba.damping.features import DURATIONS
@@ -24,11 +25,9 @@ OURS, CLOCK, REDUCTION, REVERSED = (one.name for one in (agents.OURS, agents.CLO
 
 def _ablation(
     name: str,
-    title: str,
-    heading: str,
     lines: Callable[[Runner], list[Line]],
     statements: Callable[[Runner], list[Statement]],
-    text: Callable[[Runner], str],
+    values: Callable[[Runner], dict[str, Any]] = lambda _: {},
 ) -> Table:
     """The same lines and claims on the scenes of the tables and on BAL, after the paper's baseline and Ceres' rule, and
     before our agents. The tuned one is that with which each ablation is compared."""
@@ -38,18 +37,7 @@ def _ablation(
         sets = SCENES, real_problems.bal(runner.config.real)
         return [Part(problems, every, statements(runner)) for problems in sets]
 
-    return Table(name, title, heading, text, parts)
-
-
-def _zero_text(runner: Runner) -> str:
-    net = runner.config.zero_net
-    return (
-        f"A network with {net.layers} hidden layers of {net.width} units observes the last five errors, actions and "
-        "rewards. It is trained to minimise the logarithm of the next error: "
-        f"{net.updates} updates of Adam ({net.learning_rate:g}), each with the gradient through one `lm_step` on "
-        f"{net.batch} scenes. The error is that of the *proposed* step, since a rejected one would have no gradient. "
-        "The paper does not give the optimiser, the number of updates, or whether its layers include the output."
-    )
+    return Table(name, parts, values)
 
 
 def _sized(runner: Runner) -> list[Line]:
@@ -80,22 +68,14 @@ def _scheduled(runner: Runner) -> list[Line]:
     ]
 
 
-def _schedule_text(runner: Runner) -> str:
+def _averages(runner: Runner) -> dict[str, Any]:
     known = runner.first_dampings(runner.agent(agents.OURS))
-    values = ", ".join(f"{value:.3g}" for value in average_schedule(known)) or "not known yet"
-    return (
-        "The paper repeats the first four lambdas of its agent, averaged over the test scenes: 1e-15, 1e-15, 0.194, "
-        "0.551. The same averages of our first training run on the synthetic test scenes are: "
-        f"{values}. The largest lambdas dominate an arithmetic mean over several decades. With diagonal damping, 1e-15 "
-        "is no damping at all."
-    )
+    return {"averages": ", ".join(f"{value:.3g}" for value in average_schedule(known)) or "not known yet"}
 
 
 TABLES = (
     _ablation(
         "zero-net",
-        "Table: comparison with the non-holistic Zero-net",
-        "Zero-net: the next error instead of the whole solve",
         lambda runner: [Line("Zero-net", runner.zero_net(), 8.0)],
         lambda _: [
             Statement(order_claim, "The agent beats the Zero-net ({})", "4 against 8", OURS, "zero-net"),
@@ -103,23 +83,15 @@ TABLES = (
                 ratio_claim, "The Zero-net takes two fifths of classic's iterations ({})", 0.4, "zero-net", CLASSIC
             ),
         ],
-        _zero_text,
+        lambda runner: {"net": runner.config.zero_net},
     ),
     _ablation(
         "state-size",
-        "Table: state size 1, 5, 10, 20",
-        "State size",
         _sized,
         _size_statements,
-        lambda _: (
-            "The paper calls the number of last errors in a state its batch size; its released code feeds one number "
-            "per step and samples chunks of steps. Here the observation is that many last errors, as the text says."
-        ),
     ),
     _ablation(
         "reversed",
-        "Table: reversed roles of state and reward",
-        "Reversed roles",
         lambda runner: [Line("reversed: 5 durations, error", runner.agent(agents.REVERSED), 10.0)],
         lambda _: [
             Statement(order_claim, "Reversed roles accelerate less ({})", "4 against 10", OURS, REVERSED),
@@ -127,16 +99,9 @@ TABLES = (
             Statement(success_claim, "Reversed roles succeed less often ({})", 0.7, REVERSED),
             Statement(success_claim, "Our agent always succeeds ({})", 1.0, OURS),
         ],
-        lambda _: (
-            "Interpreted as: the state is minus the time of each of the last five iterations, by the clock of the "
-            "section on rewards. The reward is minus the logarithm of the error over the best known one, with the same "
-            "bonus."
-        ),
     ),
     _ablation(
         "rewards",
-        "Table: rewards duration, constant, reduction",
-        "Rewards",
         lambda runner: [
             Line("reward: minus the duration by the clock", runner.agent(agents.CLOCK), 4.0),
             Line("reward: nothing, bonus shrinking by 1 %", runner.agent(agents.REDUCTION), 4.2),
@@ -148,18 +113,10 @@ TABLES = (
                 ("a shrinking bonus", "4 against 4.2", REDUCTION),
             )
         ],
-        lambda _: (
-            "An iteration of the compiled game has no duration of its own. The clock gives it one of "
-            f"{len(DURATIONS)} quantiles of measured durations, {min(DURATIONS):g} to {max(DURATIONS):g} of their mean "
-            f"(`jaxba/damping/features.py`), and the mean is the paper's on BAL, {agents.SECONDS:g} s, against a bonus "
-            "of 10. The agent of the other ablations has the constant reward. The shrinking bonus loses 1 % of its "
-            "first value in each iteration."
-        ),
+        lambda _: {"count": len(DURATIONS), "least": min(DURATIONS), "most": max(DURATIONS), "seconds": agents.SECONDS},
     ),
     _ablation(
         "schedule",
-        "Table: constant schedules",
-        "Constant schedules",
         _scheduled,
         lambda _: [
             Statement(order_claim, "The agent beats the paper's schedule ({})", "4 against 12", OURS, "schedule"),
@@ -174,6 +131,6 @@ TABLES = (
                 CLASSIC,
             ),
         ],
-        _schedule_text,
+        _averages,
     ),
 )

@@ -6,7 +6,8 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from jaxba.bench.profile import ITERATION_LIMIT
 from jaxba.bench.tables import number, percentage
@@ -21,6 +22,14 @@ CLASSIC, CERES = "classic", "ceres"
 """Names of the rules with which every table compares: the paper's baseline and Ceres' rule."""
 
 SCENES = Problems("synthetic", ())  # stands for the synthetic scenes, which are played and not solved one by one
+_SECTIONS = Path(__file__).parents[1].joinpath("texts.md").read_text(encoding="utf-8").split("\n## ")[1:]
+TEXTS = {
+    name: (title, heading.removeprefix("### "), " ".join(text.split()))
+    for head, heading, text in (section.split("\n\n", 2) for section in _SECTIONS)
+    for name, _, title in [head.partition(": ")]
+}
+"""What the report says of each table or figure: its title, its heading, and the paragraph below that."""
+
 NOT_YET = "Not run in this folder yet."  # text of the report if there are no results
 
 
@@ -115,10 +124,18 @@ class Table:
     """A table or figure of the paper."""
 
     name: str  # name for `--only`
-    title: str  # description for `--list`
-    heading: str  # of its section
-    text: Callable[[Runner], str]  # paragraph above the tables
     parts: Callable[[Runner], list[Part]]  # sets of problems with their methods and claims
+    values: Callable[[Runner], dict[str, Any]] = lambda _: {}  # that its paragraph in `texts.md` names
+
+    @property
+    def title(self) -> str:
+        """Description for `--list`."""
+        return TEXTS[self.name][0]
+
+    @property
+    def heading(self) -> str:
+        """Of its section."""
+        return TEXTS[self.name][1]
 
     def run(self, runner: Runner) -> None:
         """Computes the results that are missing."""
@@ -127,7 +144,7 @@ class Table:
 
     def section(self, runner: Runner) -> tuple[list[str], list[Claim]]:
         """Paragraphs of the report from the results so far, and the claims."""
-        body, claims = [self.text(runner)], []
+        body, claims = [TEXTS[self.name][2].format_map(self.values(runner))], []
         for part in self.parts(runner):
             rows = part.rows(runner)
             claims += [*judge(part.statements, rows.get, part.problems.name), *part.more(runner)]

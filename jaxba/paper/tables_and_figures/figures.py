@@ -53,16 +53,7 @@ def _small(runner: Runner) -> list[Part]:
     return parts
 
 
-SMALL = Table(
-    "small",
-    "Table: the limit of small problems, 5 x 5",
-    "Small problems",
-    lambda _: (
-        "Poses and points are unknown, the lens is known: with the nine unknowns of a BAL camera, five cameras and "
-        "five points would be underdetermined (50 equations for 53 unknowns, without the gauge)."
-    ),
-    _small,
-)
+SMALL = Table("small", _small)
 
 
 def main_problem(runner: Runner) -> Problems:
@@ -142,36 +133,10 @@ def _convergence(runner: Runner) -> list[Part]:
     ]
 
 
+_figures = lambda runner: {"figures": runner.config.figures}
+
 FIGURES = (
-    Table(
-        "lambda",
-        "Figure: chosen lambdas over the iterations",
-        "Lambda over the iterations",
-        lambda _: "The paper does not name its test case.",
-        _chart,
-    ),
-    Table(
-        "profiles",
-        "Figure: performance profiles at tau 0.1 and 0.001, and relative",
-        "Performance profiles",
-        lambda runner: (
-            "Problems of BAL on this machine, their sub-problems, and random scenes like "
-            f"`{runner.config.figures.scene}`. From a distant start, τ = 0.001 is reached in the first iterations; the "
-            "relative tolerances show the rest."
-        ),
-        _profiles,
-    ),
-    Table(
-        "convergence",
-        "Figure: convergence with explicit and implicit solvers",
-        "Convergence with explicit and implicit solvers",
-        lambda runner: (
-            "The paper's caption says that explicit means PCG and implicit means Cholesky's method, which is the other "
-            "way round in the literature. Here explicit forms the reduced camera system and factors it; implicit runs "
-            "preconditioned conjugate gradients without forming it. "
-            f"`{runner.config.figures.large_scene}` takes the place of Ladybug-1197, with at most "
-            f"{runner.config.figures.large_iterations} iterations."
-        ),
-        _convergence,
-    ),
+    Table("lambda", _chart),
+    Table("profiles", _profiles, _figures),
+    Table("convergence", _convergence, _figures),
 )

@@ -19,7 +19,7 @@ MSE_DIFFERENCE = 0.003
 """Largest difference of DeepLM's mean squared errors with and without ours. Source: the paper, after BAL's table."""
 
 
-def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
+def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> dict[str, str]:
     """A sentence on what the agents of a table were trained on."""
     pairs = {real_problems.training_files(runner.config.real, source) for source in sources}
     parts = [
@@ -28,11 +28,12 @@ def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> str:
         if files
     ]
     if not parts:
-        return "There is no other problem of this data set on this machine to train an agent on."
-    return (
+        return {"trained": "There is no other problem of this data set on this machine to train an agent on."}
+    trained = (
         "The agents of this table are trained on windows of up to 10 cameras and 40 points, with the steps that they "
         f"drive, and judged on problems that the windows are not of: {'; '.join(parts)}."
     )
+    return {"trained": trained}
 
 
 def _kitti(runner: Runner) -> list[Part]:
@@ -57,14 +58,6 @@ def _kitti(runner: Runner) -> list[Part]:
             Statement(success_claim, f"KITTI: ours ({what}) succeeds everywhere", 1.0, agent),
         ]
     return [Part(real_problems.find(runner.config.real.kitti), lines, statements, each=True)]
-
-
-def _kitti_text(runner: Runner) -> str:
-    return (
-        "`-firstN` is the sub-problem of N neighbouring cameras, starting with the camera that observes most points. "
-        "As in the paper, poses and points are unknown and the lens is known. "
-        + _trained_elsewhere(runner, real_problems.find(runner.config.real.kitti).sources)
-    )
 
 
 def _bal(runner: Runner) -> list[Part]:
@@ -139,15 +132,6 @@ def _synthetic(runner: Runner) -> list[Part]:
     ]
 
 
-def _synthetic_text(runner: Runner) -> str:
-    return (
-        "The paper trains on 10 trajectories of 10 cameras and 10 points. Agents of this run train on scenes of that "
-        "kind, with unknown poses and points as in the paper; one kind of agent trains on "
-        f"{runner.config.agents.trajectories} scenes in all. Problems of BAL are then solved with the nine unknowns of "
-        "its cameras, those of KITTI with known lenses."
-    )
-
-
 FAMILY_SECONDS = {
     "Trafalgar": (65.1, 10.2, 5.6),
     "Ladybug": (46.7, 15.35, 8.1),
@@ -187,30 +171,10 @@ def _families(runner: Runner) -> list[Part]:
 
 
 TABLES = (
-    Table("kitti", "Table: average efficiency, KITTI", "KITTI", _kitti_text, _kitti),
     Table(
-        "bal",
-        "Table: average efficiency, BAL",
-        "BAL",
-        lambda runner: _trained_elsewhere(runner, real_problems.bal(runner.config.real).sources),
-        _bal,
+        "kitti", _kitti, lambda runner: _trained_elsewhere(runner, real_problems.find(runner.config.real.kitti).sources)
     ),
-    Table(
-        "synthetic",
-        "Table: trained on synthetic scenes, tested on real problems",
-        "Synthetic training, real problems",
-        _synthetic_text,
-        _synthetic,
-    ),
-    Table(
-        "subproblems",
-        "Table: BAL's families against Ceres-CG",
-        "BAL's families against Ceres with conjugate gradients",
-        lambda _: (
-            "Seconds: set-up and iterations of a solve to convergence or 100 iterations, without compilation; means "
-            "over the family's problems on this machine. Ceres-CG is the C++ library with iterative Schur complements; "
-            "ours are the agents trained on other families of BAL."
-        ),
-        _families,
-    ),
+    Table("bal", _bal, lambda runner: _trained_elsewhere(runner, real_problems.bal(runner.config.real).sources)),
+    Table("synthetic", _synthetic, lambda runner: {"trajectories": runner.config.agents.trajectories}),
+    Table("subproblems", _families),
 )
