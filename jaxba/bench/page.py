@@ -1,6 +1,6 @@
 """One HTML page with interactive charts and sortable tables that opens without a server and fetches nothing.
 
-It holds plotly.js: 4.8 MB. It forbids its browser every address (Content-Security-Policy).
+It holds plotly.js: 4.8 MB. By its Content-Security-Policy it loads nothing but its own text and pictures it makes.
 """
 
 from __future__ import annotations
@@ -8,15 +8,13 @@ from __future__ import annotations
 import html
 import json
 import math
+import string
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
 from jaxba.bench.charts import SYMBOLS, Chart, Style
 from jaxba.bench.tables import Table
-
-POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
-"""What the page may load: its own text, and pictures that it makes."""
 
 MARKS: dict[str, str] = dict(zip(SYMBOLS, "●■◆▲▼✚★✖", strict=True))  # characters that look like plotly's markers
 DIGITS = 7  # significant digits of the numbers in a page
@@ -64,49 +62,38 @@ class Page:
 
     def to_html(self, warnings: Sequence[str] = ()) -> str:
         """The document, with warnings on top."""
-        asset = lambda name: resources.files("jaxba.bench").joinpath("assets", name).read_text(encoding="utf-8")
-        plotly = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_text(encoding="utf-8")
-        facts = "".join(
-            f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>"
-            for name, value in self.facts.items()
-            if name != "command"
-        )
-        command = f"<pre>{html.escape(self.facts['command'])}</pre>" if "command" in self.facts else ""
-        warned = "".join(f'<p class="warning">{html.escape(text)}</p>' for text in warnings)
-        body, book = "\n".join(self._sections), _json({"axes": self.axes, "charts": self._charts})
-        return (
-            '<!DOCTYPE html>\n<html lang="en" data-theme="light"><head><meta charset="utf-8">'
-            f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            f"<title>{html.escape(self.title)}</title><style>{asset('page.css')}</style></head>\n<body>"
-            f'<h1>{html.escape(self.title)}</h1>\n{command}<dl class="facts">{facts}</dl>{warned}\n'
-            '<noscript><p class="warning">The charts of this page need JavaScript.</p></noscript>\n'
-            f"{self._toolbar()}\n{body}\n"
-            f'<script type="application/json" id="book">{book}</script>\n'
-            f"<script>{plotly}</script>\n<script>{asset('page.js')}</script>\n</body></html>\n"
-        )
-
-    def _toolbar(self) -> str:
-        parts = ['<button id="theme" title="colours">dark</button>']
-        parts += [
+        read = lambda package, *path: resources.files(package).joinpath(*path).read_text(encoding="utf-8")
+        page, style, script = (read("jaxba.bench", "assets", f"page.{kind}") for kind in ("html", "css", "js"))
+        facts = (f"<dt>{html.escape(x)}</dt><dd>{html.escape(y)}</dd>" for x, y in self.facts.items() if x != "command")
+        content = _plain({"axes": self.axes, "charts": self._charts})
+        book = json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+        for character in "&<>":  # so that it may stand inside of a script element
+            book = book.replace(character, f"\\u{ord(character):04x}")
+        axes = (
             f'<button data-axis="{name}" aria-pressed="{str(k == 0).lower()}">over {name}</button>'
             for k, name in enumerate(self.axes)
-        ]
-        parts += [
+        )
+        chips = (
             f'<button class="chip" data-key="{html.escape(name)}" aria-pressed="true" title="click: hide or show; '
             f'double click: alone">{swatch(style)}{html.escape(name)}</button>'
             for name, style in self.styles.items()
-        ]
-        return f'<div class="bar">{"".join(parts)}</div>'
-
-
-def _json(value: Any) -> str:
-    """JSON that may stand inside of a script element; numbers that are not finite become null."""
-    text = json.dumps(_plain(value), allow_nan=False, separators=(",", ":"), ensure_ascii=False)
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+        )
+        return string.Template(page).substitute(
+            title=html.escape(self.title),
+            style=style,
+            script=script,
+            plotly=read("plotly", "package_data", "plotly.min.js"),
+            command=f"<pre>{html.escape(self.facts['command'])}</pre>" if "command" in self.facts else "",
+            facts="".join(f"<div>{fact}</div>" for fact in facts),
+            warnings="".join(f'<p class="warning">{html.escape(text)}</p>' for text in warnings),
+            buttons="".join([*axes, *chips]),
+            body="\n".join(self._sections),
+            book=book,
+        )
 
 
 def _plain(value: Any) -> Any:
+    """JSON of few digits; numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {name: _plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
