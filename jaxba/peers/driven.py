@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, ProblemInfo
@@ -222,7 +223,8 @@ def _evaluate(
     direct linear solver.
     """
     flip = jnp.asarray(FLIP)[:, None]
-    rotation = 2 * half_rotation(before[0][:, :4].T, after[0][:, :4].T)
+    first, second = (Rotation.from_quat(poses[:, :4]) for poses, *_ in (before, after))
+    rotation = (second * first.inv()).as_rotvec().T
     lens = (after[1] - before[1]).T
     cameras = jnp.concatenate(
         [flip * rotation, flip * (after[0][:, 4:] - before[0][:, 4:]).T, lens[jnp.array([0, 3, 4])]]
@@ -234,12 +236,3 @@ def _evaluate(
     damped = slope - jnp.sum(change * change)
     proposal = Proposal(Step(cameras, points, slope, damped, *numbers), linear.reference, jnp.zeros((), bool))
     return try_step(layout, state, damping, proposal, options, min_gain)
-
-
-def half_rotation(before: Float[Array, "4 n"], after: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
-    """`v` with `after = exp(v) before` for unit quaternions: half of the rotation vector between them, radians."""
-    v, w = before[:3], before[3]
-    vector = w * after[:3] - after[3] * v - jnp.cross(after[:3], v, axis=0)
-    real = w * after[3] + jnp.sum(after[:3] * v, axis=0)
-    sine = jnp.linalg.norm(vector, axis=0)
-    return jnp.where(sine > 0, jnp.arctan2(sine, real) / jnp.where(sine > 0, sine, 1), 1) * vector
