@@ -33,7 +33,7 @@ from jaxba.problem.options import LinearSolverChoice
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.candidates import first_search, has_repairs
 from jaxba.runtime import process
-from jaxba.runtime.compilation import Level, compiler_options, uses_older_emitters
+from jaxba.runtime.compilation import OLDER_EMITTERS, Level, compiler_options
 from jaxba.runtime.fusion import fast_compilation
 from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.methods import DEFAULT_METHOD
@@ -61,7 +61,7 @@ def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -
     """Seconds of compilation including tracing, and median seconds of a run."""
     options: Any = compiler_options(level)
     started = time.perf_counter()
-    with fast_compilation(uses_older_emitters(level)):
+    with fast_compilation(OLDER_EMITTERS in options):
         lowered = jax.jit(step).lower(*arguments)
     compiled = lowered.compile(options)
     compile_s = time.perf_counter() - started

@@ -107,17 +107,6 @@ def play_all(
     }
 
 
-def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
-    """The virtual best of several policies on a bank: for each scene the lowest cost after each iteration, and the
-    fewest iterations to convergence, each of the policy that has it. Its dampings are those of the first policy."""
-    return Trajectories(
-        costs=np.min([run.costs for run in runs], axis=0),
-        dampings=runs[0].dampings,
-        iterations=np.min([np.where(run.converged, run.iterations, limit) for run in runs], axis=0),
-        converged=np.any([run.converged for run in runs], axis=0),
-    )
-
-
 def best_costs(runs: Mapping[str, Runs], banks: Sequence[Bank]) -> list[np.ndarray]:
     """The lowest cost of each scene in the bank and in all runs."""
     return [
@@ -129,11 +118,15 @@ def best_costs(runs: Mapping[str, Runs], banks: Sequence[Bank]) -> list[np.ndarr
 def scores(
     policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
 ) -> dict[str, Score]:
-    """Scores of all policies and rules, and as `virtual best` that of the best rule for each scene.
+    """Scores of all policies and rules, and as `virtual best` that of the best rule for each scene: the lowest cost
+    after each iteration, and the fewest iterations to convergence, each of the rule that has it.
 
-    The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores.
-    """
+    The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores."""
     runs = {**policies, **rules}
-    best = best_costs(runs, banks)
-    lowest = [virtual_best([run[k] for run in rules.values()], limit) for k in range(len(banks))]
+    best, lowest = best_costs(runs, banks), []
+    for of_bank in zip(*rules.values(), strict=True):
+        length = np.min([np.where(run.converged, run.iterations, limit) for run in of_bank], axis=0)
+        costs = np.min([run.costs for run in of_bank], axis=0)
+        converged = np.any([run.converged for run in of_bank], axis=0)
+        lowest.append(Trajectories(costs, of_bank[0].dampings, length, converged))
     return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

@@ -58,18 +58,13 @@ def compiler_options(level: Level) -> Options:
     return quick_options() if level == "quick" else {}
 
 
-def uses_older_emitters(level: Level) -> bool:
-    """Whether programs of a level are compiled by XLA's older kernel emitters, for which `fast_compilation` is made."""
-    return OLDER_EMITTERS in compiler_options(level)
-
-
 class Program:
     """A function compiled by `jax.jit` at a level, for every shape of its arguments, which are given by position."""
 
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
         self.options = right_options() | compiler_options(level)
-        self._fast = uses_older_emitters(level)
+        self._fast = OLDER_EMITTERS in self.options  # for these `fast_compilation` is made
         self._jitted = jax.jit(
             _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
         )

@@ -67,7 +67,11 @@ class ExecutableCache:
         try:
             leaves, tree = jax.tree.flatten(arguments)
             key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
-            key += map(_describe_type, leaves)
+            weak = lambda leaf: "weak" if getattr(leaf, "weak_type", False) else ""
+            typed = lambda leaf: (
+                f"{leaf.dtype}{leaf.shape}{weak(leaf)}" if hasattr(leaf, "dtype") else type(leaf).__name__
+            )
+            key += map(typed, leaves)
         except _UnknownSource:
             return None
         digest = hashlib.sha256("\n".join([*key, _environment(), self._source]).encode()).hexdigest()
@@ -103,22 +107,18 @@ class ExecutableCache:
         with contextlib.suppress(OSError):
             with atomic_write(path) as file:
                 file.write(content)
-            self._evict()
+            files = sorted(self.folder.glob(f"*{SUFFIX}"), key=lambda file: -file.stat().st_mtime)
+            total = 0
+            for file in files:  # the least recently used last
+                total += file.stat().st_size
+                if total > LIMIT:
+                    file.unlink(missing_ok=True)
 
     def remove(self, stored: CachedExecutable) -> None:
         """Removes a program that could be read, but not run."""
         _load.cache_clear()
         with contextlib.suppress(OSError):
             stored.path.unlink()
-
-    def _evict(self) -> None:
-        """Removes the least recently used programs, down to `LIMIT`."""
-        found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
-        total = 0
-        for status, file in found:
-            total += status.st_size
-            if total > LIMIT:
-                file.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -235,12 +235,6 @@ def _describe_tree(tree: Any) -> str:
         return "*"
     kind, metadata = node
     return f"{_name(kind)} {_describe(metadata)} [{', '.join(map(_describe_tree, tree.children()))}]"
-
-
-def _describe_type(leaf: Any) -> str:
-    if not hasattr(leaf, "dtype"):
-        return type(leaf).__name__
-    return f"{leaf.dtype}{leaf.shape}{'weak' if getattr(leaf, 'weak_type', False) else ''}"
 
 
 def _environment() -> str:

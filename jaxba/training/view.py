@@ -36,7 +36,11 @@ def lines(
     if ended := [one for one in rows if one["episodes"]]:
         length, rule = _mean(ended, "episode/length"), _mean(ended, "episode/ceres")
         text += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
-    found = [f"{start}{text}, about {left_s:.0f} s left", start + _health(rows, decades)]
+    health = f"critics' loss {_mean(rows, 'critic_loss'):.2g}"
+    if any(one["q_bias"] is not None for one in rows):
+        health += f", bias {_mean(rows, 'q_bias'):+.2g} of {_mean(rows, 'q_mean'):.2g}"
+    health += f", entropy {_mean(rows, 'entropy'):.2f} nats, {_spread(rows, decades)}"
+    found = [f"{start}{text}, about {left_s:.0f} s left", start + health]
     values = [one["held_out/score"] for one in rows if one.get("held_out/score") is not None]
     if values:
         text = f"held out {_mean(rows, 'held_out/score'):.2f} iterations"
@@ -47,13 +51,6 @@ def lines(
         found.append(f"{start}{text}{', best on training scenes so far' if best else ''}")
         found += _warning(rows, decades)
     return found
-
-
-def _health(rows: Sequence[Row], decades: float) -> str:
-    bias = [row["q_bias"] for row in rows if row["q_bias"] is not None]
-    found = f"critics' loss {_mean(rows, 'critic_loss'):.2g}"
-    found += f", bias {_mean(rows, 'q_bias'):+.2g} of {_mean(rows, 'q_mean'):.2g}" if bias else ""
-    return f"{found}, entropy {_mean(rows, 'entropy'):.2f} nats, {_spread(rows, decades)}"
 
 
 def _spread(rows: Sequence[Row], decades: float) -> str:
