@@ -25,10 +25,9 @@ from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
 from jaxba.kitti.assemble import Frames, windows
-from jaxba.kitti.calibration import calibration_files
+from jaxba.kitti.evaluate import path_length
 from jaxba.kitti.options import Build
-from jaxba.kitti.sequence import read_sequence
-from jaxba.kitti.trajectory_errors import path_length
+from jaxba.kitti.sequence import calibration_files, read_sequence
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text

@@ -12,11 +12,10 @@ from jaxba.io.notes import report as report_notes
 from jaxba.kitti.assemble import Frames, assemble
 from jaxba.kitti.features import EPIPOLAR_PIXELS, detect, essential, match
 from jaxba.kitti.images import image_reader
-from jaxba.kitti.keyframes import choose
 from jaxba.kitti.odometry import visual_odometry
 from jaxba.kitti.options import Build
 from jaxba.kitti.sequence import Sequence
-from jaxba.kitti.tracks import Tracks, join_matches
+from jaxba.kitti.tracks import Tracks, choose, join_matches
 from jaxba.kitti.triangulate import views_of_poses
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 

@@ -15,10 +15,9 @@ import numpy as np
 
 from jaxba.io.frames import Calibration
 from jaxba.kitti.features import EPIPOLAR_PIXELS, essential
-from jaxba.kitti.keyframes import parallax, relative_rotation
 from jaxba.kitti.opencv import cv2
 from jaxba.kitti.options import MIN_MATCHES, Build
-from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.tracks import Tracks, parallax, relative_rotation
 from jaxba.kitti.triangulate import Observations, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
 

@@ -8,11 +8,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxba.io.frames import Calibration
-from jaxba.kitti import keyframes
 from jaxba.kitti.assemble import assemble, windows
 from jaxba.kitti.odometry import visual_odometry
 from jaxba.kitti.options import Build
-from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
+from jaxba.kitti.tracks import Tracks, choose, join_matches, make_tracks, parallax
 from jaxba.kitti.triangulate import Observations, Views, triangulate, triangulate_robustly
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
@@ -109,7 +108,7 @@ def test_a_camera_that_only_turns_has_no_parallax():
     turn = Rotation.from_rotvec([0.02, 0.15, -0.03]).as_matrix()
     turned = local @ turn.T
     rays = [x[:, :2] / x[:, 2:] for x in (local, turned)]
-    assert keyframes.parallax(*rays, focal=700.0) < 1e-9
+    assert parallax(*rays, focal=700.0) < 1e-9
     assert 700 * np.median(np.linalg.norm(rays[0] - rays[1], axis=1)) > 50
 
 
@@ -118,7 +117,7 @@ def test_a_sideways_step_has_the_parallax_of_its_depth():
     random = np.random.default_rng(1)
     local = np.column_stack([random.uniform(-8, 8, (200, 2)), np.where(np.arange(200) % 2, 10.0, 1000.0)])
     after = local - [0.5, 0, 0]
-    found = keyframes.parallax(local[:, :2] / local[:, 2:], after[:, :2] / after[:, 2:], 700.0)
+    found = parallax(local[:, :2] / local[:, 2:], after[:, :2] / after[:, 2:], 700.0)
     assert 10 < found < 35
 
 
@@ -127,18 +126,18 @@ def test_automatic_keyframes_skip_frames_that_stand_still():
     still = [0, 0, 0, 1, 2, 2, 3, 4, 5, 5]
     views = Views(views.rotation[still], views.translation[still])
     tracks = as_tracks(sight(views, points))
-    chosen = keyframes.choose(tracks, 10, "auto", CALIBRATION, tuple(range(10)))
+    chosen = choose(tracks, 10, "auto", CALIBRATION, tuple(range(10)))
     assert len(chosen) >= 2
     assert not {1, 2, 5, 9} & set(chosen)  # the frames whose pose is that of the frame before
-    assert keyframes.choose(tracks, 10, "4", CALIBRATION, tuple(range(10))) == [0, 4, 8]
-    assert keyframes.choose(tracks, 10, "all", CALIBRATION, tuple(range(10))) == list(range(10))
+    assert choose(tracks, 10, "4", CALIBRATION, tuple(range(10))) == [0, 4, 8]
+    assert choose(tracks, 10, "all", CALIBRATION, tuple(range(10))) == list(range(10))
     with pytest.raises(ProblemError, match="hardly moves in frames 0 to 2"):
-        keyframes.choose(tracks.restrict([0, 1, 2]), 3, "auto", CALIBRATION, (0, 1, 2))
+        choose(tracks.restrict([0, 1, 2]), 3, "auto", CALIBRATION, (0, 1, 2))
     with pytest.raises(ProblemError, match="--keyframes 99 leaves one key-frame of 10 in frames 0 to 9"):
-        keyframes.choose(tracks, 10, "99", CALIBRATION, tuple(range(10)))
+        choose(tracks, 10, "99", CALIBRATION, tuple(range(10)))
     for choice in ("0", "some", "-1", "1.5"):
         with pytest.raises(ProblemError, match="--keyframes must be"):
-            keyframes.choose(tracks, 10, choice, CALIBRATION, tuple(range(10)))
+            choose(tracks, 10, choice, CALIBRATION, tuple(range(10)))
 
 
 def test_keyframes_that_share_too_little_are_named():
@@ -146,7 +145,7 @@ def test_keyframes_that_share_too_little_are_named():
         np.repeat([0, 1, 1, 2], 30), np.repeat([0, 100], 60) + np.tile(np.arange(30), 4), np.zeros((120, 2))
     )
     with pytest.raises(ProblemError, match="key-frames 7 and 9 share 0 tracks"):
-        keyframes.choose(tracks, 3, "2", CALIBRATION, (7, 8, 9))
+        choose(tracks, 3, "2", CALIBRATION, (7, 8, 9))
 
 
 # Visual odometry

@@ -10,8 +10,7 @@ import pytest
 
 from jaxba.io.frames import Calibration, poses_of
 from jaxba.io.poses import Poses, read_poses
-from jaxba.kitti.calibration import read_calibration
-from jaxba.kitti.sequence import read_sequence
+from jaxba.kitti.sequence import read_calibration, read_sequence
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")

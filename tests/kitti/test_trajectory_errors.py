@@ -7,8 +7,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from jaxba.kitti import trajectory_errors
-from jaxba.kitti.trajectory_errors import absolute_errors, relative_errors, segment_errors
+from jaxba.kitti.evaluate import DEVKIT_LENGTHS, absolute_errors, path_length, relative_errors, segment_errors
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.similarity import umeyama
 
@@ -170,7 +169,7 @@ def devkit(estimate: np.ndarray, truth: np.ndarray, lengths) -> tuple[float, flo
 def test_segment_errors_are_those_of_the_development_kit():
     truth = wander(400, 11)
     estimate = noisy(truth, 12, 0.1)
-    for lengths in (trajectory_errors.DEVKIT_LENGTHS, (5.0, 17.0)):
+    for lengths in (DEVKIT_LENGTHS, (5.0, 17.0)):
         found = segment_errors(estimate, truth, lengths)
         assert found is not None
         assert tuple(found) == pytest.approx(devkit(estimate, truth, lengths), rel=1e-8)
@@ -206,4 +205,4 @@ def test_poses_that_all_stand_in_one_place_cannot_be_aligned():
 def test_path_length_of_a_square():
     corners = np.zeros((5, 3, 4))
     corners[:, :2, 3] = [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
-    assert trajectory_errors.path_length(corners) == pytest.approx(8)
+    assert path_length(corners) == pytest.approx(8)
