@@ -28,8 +28,7 @@ from scipy.spatial import KDTree
 import jaxba
 from jaxba.game.statistics import geometric_mean, paired_ratio
 from jaxba.io import read_problem
-from jaxba.io.frames import poses_of, read_sidecar
-from jaxba.io.poses import read_poses
+from jaxba.io.frames import poses_of, read_poses, read_sidecar
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.similarity import umeyama

@@ -20,9 +20,8 @@ from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
 from jaxba.io import check_output, write_problem
 from jaxba.io.files import sidecar_path, strip_compression
 from jaxba.io.formats import FORMATS, by_ending
-from jaxba.io.frames import poses_of, read_sidecar, write_sidecar
+from jaxba.io.frames import poses_of, read_poses, read_sidecar, write_sidecar
 from jaxba.io.notes import note, note_center
-from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
 from jaxba.kitti.assemble import Frames, windows
 from jaxba.kitti.evaluate import path_length

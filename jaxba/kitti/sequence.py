@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.io.files import StrPath, display_name, visible
-from jaxba.io.frames import Calibration
-from jaxba.io.poses import lines_of, numbers_of
+from jaxba.io.frames import Calibration, lines_of, numbers_of
 from jaxba.problem.bundle_problem import ProblemError
 
 FILES = ("calib.txt", "K.txt", "calib_cam_to_cam.txt", "perspective.txt")

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxba.io.frames import Calibration, poses_of
-from jaxba.io.poses import Poses, read_poses
+from jaxba.io.frames import Calibration, Poses, poses_of, read_poses
 from jaxba.kitti.sequence import read_calibration, read_sequence
 from jaxba.problem.bundle_problem import ProblemError
 
