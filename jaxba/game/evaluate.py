@@ -10,9 +10,8 @@ from jaxtyping import Float
 
 from jaxba.damping import ConstantAction, DampingPolicy
 from jaxba.game.env import GameConfig
-from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.rollout import Trajectories, play
+from jaxba.game.rollout import Trajectories, alike, play
 from jaxba.game.scene_bank import Bank, reach
 from jaxba.game.statistics import capped, geometric_mean
 from jaxba.problem.options import StepOptions

@@ -7,15 +7,17 @@ scene.
 from __future__ import annotations
 
 import functools
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping import DampingPolicy
+from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
@@ -25,6 +27,56 @@ from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.solver.iteration import Carry, begin, iterate
 from jaxba.solver.lanes import refill
+from jaxba.typing import register_pytree
+
+
+@register_pytree
+@dataclass(frozen=True)
+class OneOf:
+    """Several policies as one, so that they share compiled programs: that of a number, which is traced, is asked."""
+
+    policies: tuple[Any, ...]
+    number: Any
+
+    @property
+    def min_gain(self) -> Array:
+        """See `DampingPolicy`."""
+        return jnp.stack([jnp.asarray(one.min_gain) for one in self.policies])[self.number]
+
+    def init(self, info: ProblemInfo) -> tuple[Any, Array]:
+        """See `DampingPolicy`."""
+        states, dampings = zip(*(one.init(info) for one in self.policies), strict=True)
+        return states, jnp.stack(dampings)[self.number]
+
+    def propose(self, state: tuple[Any, ...], step: StepInfo) -> tuple[Any, Array]:
+        """See `DampingPolicy`."""
+
+        def ask(k: int, states: tuple[Any, ...]) -> tuple[Any, Array]:
+            after, damping = self.policies[k].propose(states[k], step)
+            return (*states[:k], after, *states[k + 1 :]), damping
+
+        asked = [lambda states, k=k: ask(k, states) for k in range(len(self.policies))]
+        return lax.switch(self.number, asked, state)
+
+
+def alike(policies: Mapping[str, tuple[DampingPolicy, StepOptions]]) -> dict[str, tuple[DampingPolicy, StepOptions]]:
+    """Policies with their steps; those with equal steps have one structure, so that a function compiles once."""
+    kinds: dict[StepOptions, dict[Hashable, DampingPolicy]] = {}
+    for policy, options in policies.values():
+        kinds.setdefault(options, {}).setdefault(_kind(policy), policy)
+    found = {}
+    for name, (policy, options) in policies.items():
+        same = kinds[options]
+        number = list(same).index(_kind(policy))
+        one = OneOf(tuple(policy if k == number else x for k, x in enumerate(same.values())), jnp.asarray(number))
+        found[name] = (one if len(same) > 1 else policy), options
+    return found
+
+
+def _kind(policy: DampingPolicy) -> Hashable:
+    leaves, structure = jax.tree.flatten(policy)
+    return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+
 
 LANES = 128  # scenes solved at a time
 

@@ -19,9 +19,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import ProblemInfo, make_policy
-from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
-from jaxba.game.rollout import play
+from jaxba.game.rollout import alike, play
 from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
 from jaxba.game.windows import read_windows
 from jaxba.io.files import StrPath

@@ -17,14 +17,13 @@ from jaxba.damping.features import observation_size
 from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.game.env import GameConfig
 from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
-from jaxba.game.one_of import alike
 from jaxba.game.random_scenes import (
     MOST_CAMERAS,
     MOST_POINTS,
     SceneClass,
     make_scenes,
 )
-from jaxba.game.rollout import Trajectories, play
+from jaxba.game.rollout import Trajectories, alike, play
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.statistics import paired_ratio
