@@ -1,7 +1,7 @@
 """Tests by fixed rules whether the results of a run reproduce the paper's claims.
 
 A claim is about a ratio (our method takes a fifth of classic's iterations), an order (five errors are better than one)
-or a fraction (all solves succeed). The report states the rules (`CRITERION`).
+or a fraction (all solves succeed). The report states the rules (`criterion` in texts.md).
 """
 
 from __future__ import annotations
@@ -24,25 +24,9 @@ method whose iterations or seconds are compared."""
 
 PARTLY_FRACTION_TOLERANCE = 0.15  # a fraction is partly reproduced if ours differs from the paper's by at most this
 
-CRITERION = (
-    f"A **ratio** is *reproduced* if ours is the paper's up to a factor of {RATIO_TOLERANCE:g}, larger or smaller, "
-    f"*partly* if it is at most {PARTLY_RATIO:g} (a gain of another size), else *not*. "
-    "An **order** (A takes fewer iterations than B) is *reproduced* "
-    f"if A takes at most {PARTLY_RATIO:g} of B's iterations and their ranges over the training runs do not overlap, "
-    "*partly* if only A's mean is lower, else *not*. "
-    f"A **fraction** is *reproduced* within {100 * FRACTION_TOLERANCE:.0f} percentage points, *partly* within "
-    f"{100 * PARTLY_FRACTION_TOLERANCE:.0f}. A claim about iterations or seconds is *not* reproduced, whatever the "
-    "numbers, if the fraction of problems on which the method succeeds is lower than that of the other method by more "
-    "than five percentage points, and *not run* if it was not run on all of them, or if most training runs of a method "
-    "*collapsed*: their policies do the same in every state. An **error** is *reproduced* if ours "
-    "is larger by less than the paper's difference on every problem, *partly* if on half of them, else *not*. "
-    "The column `to f*(1+1e-3)` compares the iterations until the cost is within 1e-3 of the best known one; verdicts "
-    "are by the stop rule, as the paper's numbers."
-)
-
 
 class Claim(NamedTuple):
-    """A claim of the paper and whether it is reproduced, by `CRITERION`."""
+    """A claim of the paper and whether it is reproduced."""
 
     text: str  # in words
     paper: str  # the paper's number

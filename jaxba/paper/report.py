@@ -8,11 +8,12 @@ from jaxba.bench import profile
 from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
 from jaxba.bench.page import Page
 from jaxba.bench.run import machine
+from jaxba.paper import claims as rules
 from jaxba.paper.agents import BEST, OURS, PRINTED, updates
-from jaxba.paper.claims import CRITERION, Claim
+from jaxba.paper.claims import Claim
 from jaxba.paper.runner import Runner
 from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
-from jaxba.paper.tables_and_figures.common import table
+from jaxba.paper.tables_and_figures.common import TEXTS, table
 from jaxba.paper.tables_and_figures.figures import FIGURES
 from jaxba.runtime.atomic import write_text
 from jaxba.settings import to_yaml
@@ -66,7 +67,12 @@ def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
         "rejected. Means are arithmetic, as in the paper; **a failure counts as 100 iterations**.",
         "## Claims",
         "; ".join(f"{count} {status}" for status, count in tally.items()) + f" of {len(claims)}.",
-        CRITERION,
+        TEXTS["criterion"][2].format(
+            ratio=rules.RATIO_TOLERANCE,
+            partly=rules.PARTLY_RATIO,
+            near=100 * rules.FRACTION_TOLERANCE,
+            far=100 * rules.PARTLY_FRACTION_TOLERANCE,
+        ),
         table(("claim", "paper", "ours", "to f\\*(1+1e-3)", "result"), cells).replace("\\*\\*", "**"),
     ]
     return "\n\n".join(parts) + "\n"
