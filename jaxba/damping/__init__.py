@@ -5,22 +5,3 @@ from jaxba.damping.policy import DampingPolicy, ProblemInfo
 from jaxba.damping.policy_file import load_policy, save_policy
 from jaxba.damping.registry import LEARNED, POLICIES, brings_step, is_learned, make_policy
 from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
-
-__all__ = [
-    "LEARNED",
-    "POLICIES",
-    "AgentPolicy",
-    "Ceres",
-    "Classic",
-    "ConstantAction",
-    "DampingPolicy",
-    "Geometric",
-    "LearnedPolicy",
-    "ProblemInfo",
-    "Schedule",
-    "brings_step",
-    "is_learned",
-    "load_policy",
-    "make_policy",
-    "save_policy",
-]

@@ -13,22 +13,6 @@ from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.ply import write_ply
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 
-__all__ = [
-    "ProblemWarning",
-    "check_output",
-    "is_colmap",
-    "is_folder",
-    "read_bal",
-    "read_bundler",
-    "read_colmap",
-    "read_problem",
-    "write_bal",
-    "write_bundler",
-    "write_colmap",
-    "write_ply",
-    "write_problem",
-]
-
 
 def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
     """Reads a problem in any format that is known: a folder is a COLMAP model or OpenSfM's, a file is what its ending

@@ -2,13 +2,3 @@
 
 from jaxba.scenes.config import DEFAULT_SCENES, LIKE, SceneConfig, Trajectory, scene_like
 from jaxba.scenes.generate import random_scene, random_scene_with_truth
-
-__all__ = [
-    "DEFAULT_SCENES",
-    "LIKE",
-    "SceneConfig",
-    "Trajectory",
-    "random_scene",
-    "random_scene_with_truth",
-    "scene_like",
-]

@@ -7,5 +7,3 @@ without COLMAP. Source: COLMAP, doc/cameras.rst and doc/format.rst.
 from jaxba.io.colmap.files import is_colmap
 from jaxba.io.colmap.read import read_colmap
 from jaxba.io.colmap.write import write_colmap
-
-__all__ = ["is_colmap", "read_colmap", "write_colmap"]
