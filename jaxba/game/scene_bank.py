@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping import ProblemInfo, make_policy
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.rollout import alike, play
-from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.windows import read_windows
 from jaxba.io.files import StrPath
 from jaxba.model.linearize import cost
@@ -88,19 +88,6 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
         return cost(with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss())
 
     return jax.lax.map(one, scenes, batch_size=256)
-
-
-DRAWN = 64  # scenes of which `draw` takes the first that is worth solving; 85% of the default class are
-
-
-@for_traces
-def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
-    """A class's random scene of this number and key. Raises ValueError: none of `DRAWN` scenes is worth solving."""
-    scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
-    rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
-    if not len(rows):
-        raise ValueError(f"no scene of {_shape(kind)} is worth solving")
-    return scene_problem(kind, scenes, int(rows[0]))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The layout that all scenes of a class share, how a scene's observations are put into it, and a scene as a problem."""
+"""The layout that all scenes of a class share, and how a scene's observations are put into it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.game.random_scenes import SceneClass, Scenes
+from jaxba.game.random_scenes import SceneClass
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout, build_layout
@@ -41,13 +41,3 @@ def with_scene(layout: Layout, pixels: Float[AnyArray, "2 slots"], mask: Bool[An
     cameras = layout.num_cameras
     seen = jnp.any(mask.reshape(cameras, -1), axis=1)
     return replace(layout, pixels=pixels, slot_mask=mask, camera_seen=seen)
-
-
-def scene_problem(kind: SceneClass, scenes: Scenes, number: int) -> BundleProblem:
-    """One of the scenes as a problem, without what is not observed."""
-    cameras, points, pixels, mask = (np.asarray(field[number]) for field in scenes)
-    seen = mask.reshape(kind.cameras, kind.points + 1)[:, :-1]
-    camera, point = np.nonzero(seen)
-    (used_cameras, camera), (used_points, point) = (np.unique(x, return_inverse=True) for x in (camera, point))
-    observed = pixels.reshape(2, kind.cameras, kind.points + 1)[:, :, :-1][:, seen].T
-    return BundleProblem.create(cameras.T[used_cameras], points.T[used_points], observed, camera, point)
