@@ -46,27 +46,19 @@ Built: TypeAlias = tuple[DampingPolicy, SolveOptions]
 
 @dataclass(frozen=True)
 class Method:
-    """The solver of a table row: a policy, perhaps with several training runs, and the options of the step."""
+    """The solver of a table row: a policy, perhaps with several training runs, and the options of the step.
 
-    name: str
-    """Name in records."""
+    `build` and `driver` get the number of a training run, and a real problem (None: the scenes of the tables); they
+    return None if there is no policy for it. Rules ignore both. They may train it, so they are called only if something
+    has to be run. A policy has collapsed if it does the same in every state in the end.
+    """
 
-    build: Callable[[int, Source | None], Built | None]
-    """Policy and options of a training run, by its number, for a real problem or else the scenes of the tables; None
-    if there is none for this problem. Rules ignore both. This may train the policy, so it is called only if something
-    has to be run."""
-
-    seeds: int = 0
-    """Number of training runs; 0 for a rule."""
-
-    peer: SolverName | None = None
-    """Another library that solves real problems, in place of `build`."""
-
-    driver: Callable[[int, Source], Path | None] | None = None
-    """File of the policy of a training run that drives the other library; without one it has its own rule."""
-
-    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False
-    """Whether most of the training runs for these problems ended with a policy that does the same in every state."""
+    name: str  # in records
+    build: Callable[[int, Source | None], Built | None]  # policy and options of a training run
+    seeds: int = 0  # number of training runs; 0 for a rule
+    peer: SolverName | None = None  # another library that solves real problems, in place of `build`
+    driver: Callable[[int, Source], Path | None] | None = None  # file of the policy that drives it; None: its own rule
+    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False  # whether most policies do so
 
     @property
     def numbers(self) -> range:
