@@ -48,8 +48,7 @@ class TargetSummary(NamedTuple):
     """Statistics of a solver on one target over all problems, `total`, also those that it was not run on.
 
     Means are geometric: over the reached problems, with a count of 0 taken as 1, NaN if there are none; of
-    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`.
-    """
+    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`."""
 
     reached: int
     total: int

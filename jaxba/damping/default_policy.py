@@ -43,8 +43,7 @@ def smallest_decades(low: float, dtype: Any) -> float:
     """log10 of the smallest lambda: `low`, but not below the rounding unit, which is lost in a sum with a diagonal.
 
     In float64 that is below every policy's range. In float32 `bold` would go to 1e-9, at which the systems of real
-    problems have no correct digit left, and steps are rejected or shortened to a quarter.
-    """
+    problems have no correct digit left, and steps are rejected or shortened to a quarter."""
     return max(low, math.log10(float(jnp.finfo(dtype).eps)))
 
 
@@ -55,8 +54,7 @@ class Rescue(NamedTuple):
     """Ceres' rule in reserve: it takes over from a bold choice of lambda that was rejected too often, to the end.
 
     It starts at the last accepted lambda, or at its own first one if a larger lambda was rejected since. It starts
-    again in the same way when it is rejected as often in a row itself.
-    """
+    again in the same way when it is rejected as often in a row itself."""
 
     worked: Float[Array, ""]  # log10 of the last accepted lambda
     in_a_row: Int[Array, ""]  # rejections
@@ -99,8 +97,7 @@ class Guarded:
     A rejection raises lambda by half a decade, and so does every time that an accepted step was shortened. A step of
     full length brings it back, unless it was inexact. After two rejections in a row, or eight in all, Ceres' rule
     chooses it to the end (`Rescue`). Both numbers, and three point iterations for one, were chosen by `python -m
-    benchmarks.default_policy`, in the means and beside the better of other policies.
-    """
+    benchmarks.default_policy`, in the means and beside the better of other policies."""
 
     min_gain: float = 0.25
     """Gain ratio that a candidate must exceed; otherwise the step is shortened and tried again. Source: the sufficient

@@ -172,8 +172,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
 def duration(step: StepInfo) -> Float[Array, ""]:
     """Duration of an iteration by the game's clock over the mean: one of `DURATIONS`, as it has none of its own.
 
-    Bits of the candidate's cost and of lambda draw it: reward and observation agree, and a solve repeats.
-    """
+    Bits of the candidate's cost and of lambda draw it: reward and observation agree, and a solve repeats."""
     bits = [lax.bitcast_convert_type(x.astype(jnp.float32), jnp.uint32) for x in (step.candidate_cost, step.damping)]
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), bits[0]), bits[1])
     choices = jnp.asarray(DURATIONS, step.cost.dtype)

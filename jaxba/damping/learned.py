@@ -58,8 +58,7 @@ class AgentPolicy(ABC):
 class ConstantAction(AgentPolicy):
     """The same action in every iteration: what the guard alone achieves, without a network.
 
-    The best constant action of a game is the baseline that training has to beat.
-    """
+    The best constant action of a game is the baseline that training has to beat."""
 
     action: tuple[float]
     """In [-1, 1]."""
@@ -100,8 +99,7 @@ class Layer(NamedTuple):
 class LearnedPolicy(ArrayRecord, AgentPolicy):
     """The mean action of a trained actor, limited by the guard.
 
-    The weights are traced: another policy of the same shape never recompiles.
-    """
+    The weights are traced: another policy of the same shape never recompiles."""
 
     layers: tuple[Layer, ...]
     """Hidden layers with ReLU, then mean and log standard deviation of the action before its tanh."""

@@ -70,8 +70,7 @@ class DampingPolicy(Protocol):
     one never recompiles, and its class selects the code. Both functions are pure and jittable.
 
     A policy may have a third function: `step_options(base)` gives the `StepOptions` that it was made for, which `solve`
-    uses unless its options say otherwise.
-    """
+    uses unless its options say otherwise."""
 
     @property
     def min_gain(self) -> Any:

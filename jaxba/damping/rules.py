@@ -31,8 +31,7 @@ class Ceres:
     """Ceres' trust-region rule with radius 1 / lambda.
 
     Accepted with gain `rho`: lambda times `clip(1 - (2 rho - 1)^3, 1/3, upper)`; rejected: times 2, 4, 8 ...
-    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section 3.2).
-    """
+    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section 3.2)."""
 
     initial: float = 1e-4
     """First lambda. Source: Ceres initial_trust_region_radius 1e4."""
@@ -75,8 +74,7 @@ def nielsen() -> Ceres:
     """g2o's rule: as Ceres', but an accepted step always shrinks lambda (factor in [1/3, 2/3]).
 
     Source: g2o optimization_algorithm_levenberg.cpp: first lambda 1e-5 times the largest Hessian diagonal, which
-    under diagonal scaling is 1e-5 itself; any decrease is accepted.
-    """
+    under diagonal scaling is 1e-5 itself; any decrease is accepted."""
     return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=SMALLEST, relative=1.0)
 
 
@@ -124,8 +122,7 @@ class Classic(Geometric):
 
     Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain threshold
     0.4 as in the authors' released code, since the printed text swaps them. A step that lowers the cost is
-    always accepted.
-    """
+    always accepted."""
 
     initial: float = 0.25
     success: float = 0.5
@@ -155,8 +152,7 @@ def theseus() -> Geometric:
 class Schedule:
     """Repeats a list of lambdas whatever happens; a list of one is a constant.
 
-    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors' agent.
-    """
+    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors' agent."""
 
     values: tuple[float, ...] = (1e-15, 1e-15, 0.194, 0.551)
     """Lambdas, in order."""
@@ -177,6 +173,5 @@ class Schedule:
 def gauss_newton() -> Schedule:
     """Next to no damping. The seven gauge freedoms make the undamped system singular, so lambda is 1e-10.
 
-    Under diagonal scaling this changes no direction that the observations determine by more than 1e-10.
-    """
+    Under diagonal scaling this changes no direction that the observations determine by more than 1e-10."""
     return Schedule(values=(1e-10,))

@@ -38,8 +38,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
     """All scenes of a game. Where an episode ends, another begins in the same step.
 
     For each episode that ended, `infos` has the last observation in `final_obs` and the metrics of the episode in
-    `final_info`: `length`, `success`, `rejections`, and `ceres`, the iterations that Ceres' rule takes.
-    """
+    `final_info`: `length`, `success`, `rejections`, and `ceres`, the iterations that Ceres' rule takes."""
 
     def __init__(self, game: Game) -> None:
         """Random numbers are seeded by the operating system until `reset` is given a seed."""
@@ -93,8 +92,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
 class GymGame(gymnasium.Env):
     """A game of one scene at a time, a random one of the bank in every episode.
 
-    When an episode ends, `info` has the metrics that `GymVectorGame` has in `final_info`.
-    """
+    When an episode ends, `info` has the metrics that `GymVectorGame` has in `final_info`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 

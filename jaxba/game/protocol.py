@@ -34,8 +34,7 @@ class Step(NamedTuple):
 class Environment(Protocol):
     """A batch of environments that reset themselves. A pytree (`jaxba.register_pytree`).
 
-    Its arrays are traced, its sizes static. Observations must be finite.
-    """
+    Its arrays are traced, its sizes static. Observations must be finite."""
 
     @property
     def num_envs(self) -> int:

@@ -285,8 +285,7 @@ def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
     Source: the text of Belder et al. 2023, which draws points and camera poses at random and names no distribution:
     here points in a cube, and cameras in all directions around it that look at a random place in it, with a random
     roll. The noise is that of the paper's equation 1, without which the best cost would be zero and a relative
-    tolerance meaningless. The text does not say either how far off a start is (`PAPER_START`).
-    """
+    tolerance meaningless. The text does not say either how far off a start is (`PAPER_START`)."""
     keys = iter(jax.random.split(key, 10))
     normal = lambda *shape: jax.random.normal(next(keys), shape)
     world = jax.random.uniform(next(keys), (kind.points, 3), minval=-2.0, maxval=2.0)

@@ -19,8 +19,7 @@ from jaxba.typing import AnyArray
 def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
     """A layout with an observation slot for every pair of a camera and a point; see `with_scene`.
 
-    Random clusters, if any, are those of a scene where all see all: scenes of a class share them.
-    """
+    Random clusters, if any, are those of a scene where all see all: scenes of a class share them."""
     return _layout(kind, StepOptions(method=options.method) if options.cluster_cameras else StepOptions())
 
 

@@ -62,8 +62,7 @@ def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: s
 class Text:
     """The text of a file: lines one after the other, then the numbers in all that follows.
 
-    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0.
-    """
+    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0."""
 
     def __init__(self, text: bytes, name: str):
         """`text` of the file called `name`, with lines that end in LF."""

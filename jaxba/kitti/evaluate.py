@@ -48,8 +48,7 @@ class SegmentErrors(NamedTuple):
 def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
     """Distances between camera centres, in units of the truth; `rmse` is the ATE, as `evo_ape -a -s` prints it.
 
-    Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", section IV.B.
-    """
+    Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", section IV.B."""
     return _statistics(np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1))
 
 
@@ -67,8 +66,7 @@ def segment_errors(aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DE
 
     A segment of length L goes from every tenth pose to the first that is more than L farther along the true path.
 
-    Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`).
-    """
+    Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`)."""
     steps = np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     pairs = []

@@ -32,8 +32,7 @@ def detect(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Flo
 def match(first: Float[np.ndarray, "n 128"], second: Float[np.ndarray, "k 128"]) -> Int[np.ndarray, "m 2"]:
     """Descriptors of two images that are mutual nearest neighbours and pass the ratio test in both directions.
 
-    Distances between integers below 2^24 are exact in float32.
-    """
+    Distances between integers below 2^24 are exact in float32."""
     if min(len(first), len(second)) < 2:
         return np.empty((0, 2), np.int64)
     squared = np.maximum((first**2).sum(1)[:, None] + (second**2).sum(1) - 2 * (first @ second.T), 0)
@@ -54,8 +53,7 @@ def essential(
     """Essential matrix of two views by the five-point method and OpenCV's most accurate RANSAC, and which of the rays
     `(X / Z, Y / Z)` are consistent with it: within this distance of the epipolar line, in units of the focal length.
 
-    Source: Nister 2004, "An efficient solution to the five-point relative pose problem"; OpenCV's findEssentialMat.
-    """
+    Source: Nister 2004, "An efficient solution to the five-point relative pose problem"; OpenCV's findEssentialMat."""
     if len(first) < MIN_ESSENTIAL:
         return None, np.zeros(len(first), bool)
     matrix, mask = cv2.findEssentialMat(

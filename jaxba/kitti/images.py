@@ -67,8 +67,7 @@ def _decode(path: Path) -> np.ndarray:
 def _is_complete_png(data: bytes) -> bool:
     """Whether the bytes are a complete PNG file, and all its chunks have the right checksums.
 
-    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content.
-    """
+    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content."""
     at = len(PNG_SIGNATURE)
     if data[:at] != PNG_SIGNATURE:
         return False

@@ -152,8 +152,7 @@ def visual_odometry(
 def _bootstrap(scene: _Scene, views: int, names: tuple[int, ...]) -> tuple[int, int, _Motion]:
     """The first two views and their motion: the best pair of the first view that has a good one.
 
-    A good pair has many inliers and enough parallax; the best one, by their product, of these or else of all.
-    """
+    A good pair has many inliers and enough parallax; the best one, by their product, of these or else of all."""
     found: list[tuple[bool, float, int, int]] = []
     motions: dict[tuple[int, int], _Motion] = {}
     largest = 0.0

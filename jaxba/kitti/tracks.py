@@ -117,8 +117,7 @@ def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], 
 
     The rotation is the least-squares fit to the rays, which absorbs a little of a translation where the scene is far.
 
-    Rays are `(X / Z, Y / Z)`, the focal length is in pixels.
-    """
+    Rays are `(X / Z, Y / Z)`, the focal length is in pixels."""
     rotated = np.column_stack([first, np.ones(len(first))]) @ relative_rotation(first, second).T
     return float(focal * np.median(np.linalg.norm(perspective(rotated) - second, axis=1)))
 

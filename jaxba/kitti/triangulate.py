@@ -115,8 +115,7 @@ def triangulate_robustly(
 
     Points are triangulated once more without the observations whose errors are too large.
 
-    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees apart.
-    """
+    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees apart."""
     first = triangulate(views, observations)
     points, keep = first.points, (first.error <= error) & (first.depth > 0)
     keep &= np.bincount(observations.track[keep], minlength=len(points))[observations.track] >= min_views

@@ -43,8 +43,7 @@ class FamilyConfig:
     """A family of real problems.
 
     Files are paths, in which $VARIABLES and wildcards are expanded, or names of downloaded BAL problems. Missing ones
-    are left out and listed in the report.
-    """
+    are left out and listed in the report."""
 
     name: str  # in tables; the paper's numbers are found by it
     files: tuple[str, ...]

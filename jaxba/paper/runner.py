@@ -50,8 +50,7 @@ class Method:
 
     `build` and `driver` get the number of a training run, and a real problem (None: the scenes of the tables); they
     return None if there is no policy for it. Rules ignore both. They may train it, so they are called only if something
-    has to be run. A policy has collapsed if it does the same in every state in the end.
-    """
+    has to be run. A policy has collapsed if it does the same in every state in the end."""
 
     name: str  # in records
     build: Callable[[int, Source | None], Built | None]  # policy and options of a training run

@@ -52,8 +52,7 @@ def pose_manifold() -> Any:
 
     Neither package can create one from Python (pyceres 2.6, pycolmap 4.2.1), so it is taken from a bundle adjuster of
     two images and one point. That problem and the object which `get_manifold` returns both own the manifold and would
-    free it twice. Therefore both are kept until the process ends, which costs a few kilobytes.
-    """
+    free it twice. Therefore both are kept until the process ends, which costs a few kilobytes."""
     model = pycolmap.Reconstruction()
     lens = pycolmap.Camera(camera_id=1, model="RADIAL", width=1, height=1, params=[1.0, 0, 0, 0, 0])
     model.add_camera_with_trivial_rig(lens)
@@ -77,8 +76,7 @@ def pose_manifold() -> Any:
 class TwoSidedReprojection(pyceres.CostFunction):
     """The reprojection error of `reprojection`, also for points behind their camera, as BAL defines it.
 
-    It is evaluated in Python and therefore slow. It is used only for the few observations that COLMAP ignores.
-    """
+    It is evaluated in Python and therefore slow. It is used only for the few observations that COLMAP ignores."""
 
     def __init__(self, pixel: Float[np.ndarray, " 2"]) -> None:
         super().__init__()
@@ -120,8 +118,7 @@ class ColmapProblem:
     would be zero. `count_behind` does the same for points that move behind their camera later.
 
     Ceres holds raw pointers into `poses`, `lenses` and `points`, and to the cost functions. This object owns all of
-    them, so it must live for as long as `ceres` is used.
-    """
+    them, so it must live for as long as `ceres` is used."""
 
     def __init__(self, problem: BundleProblem) -> None:
         """Copies the parameters. Raises ProblemError: covariances, lenses, constants, priors or rigs."""

@@ -57,8 +57,7 @@ _advance, _begin = jit(advance), jit(begin)
 class _SummaryRecorder(pyceres.IterationCallback):
     """Keeps the summaries of a call of Ceres: of the start, and of the iteration if it was completed.
 
-    One object serves all calls, since assigning `SolverOptions.callbacks` a second time appends to it (pyceres 2.6).
-    """
+    One object serves all calls, since assigning `SolverOptions.callbacks` a second time appends to it (pyceres 2.6)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,8 +72,7 @@ class _AcceptAnyStep(pyceres.CostFunction):
     """A residual that makes Ceres accept any step: large at the first evaluation after `reset`, zero afterwards.
 
     Its Jacobian is zero, so that it does not enter the linear system. It has two residuals and depends on one point,
-    as an observation does, since Ceres has code specialised for these sizes.
-    """
+    as an observation does, since Ceres has code specialised for these sizes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -220,8 +218,7 @@ def _evaluate(
 
     `before` and `after` are `(poses [c, 7], lenses [c, 5], points [p, 3])`. `numbers` of a step are known to Ceres
     alone: the largest gradient entry before it, and the iterations and the forcing term of conjugate gradients, 0 for a
-    direct linear solver.
-    """
+    direct linear solver."""
     flip = jnp.asarray(FLIP)[:, None]
     first, second = (Rotation.from_quat(poses[:, :4]) for poses, *_ in (before, after))
     rotation = (second * first.inv()).as_rotvec().T

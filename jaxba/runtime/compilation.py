@@ -120,8 +120,7 @@ class ParallelCompilation:
     XLA compiles one program on little more than one core. The thread that leaves the context compiles what is still
     waiting; it is the one that runs the programs, so that the memory that compiling took is reused for running
     (`process.keep_memory`). The context may be entered again for more programs. A program is compiled once, for the
-    arguments that it was given first.
-    """
+    arguments that it was given first."""
 
     def __init__(self) -> None:
         self.loaded: dict[Program, CachedExecutable] = {}
@@ -241,8 +240,7 @@ class CompileClock:
     """Adds up the time that JAX spends on tracing and compiling while its context is open.
 
     `seconds` may be read at any moment. Compilation in other threads counts too. Tracing one function inside another is
-    reported by both, so the sum can slightly exceed the wall time.
-    """
+    reported by both, so the sum can slightly exceed the wall time."""
 
     def __init__(self) -> None:
         self.seconds = 0.0

@@ -145,8 +145,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
 def _threads(count: int) -> Iterator[None]:
     """In which JAX starts with so many of XLA's threads for virtual devices, unless it has started or NPROC is set.
 
-    Devices share them: with few, batched factorisations of several wait for each other for ever.
-    """
+    Devices share them: with few, batched factorisations of several wait for each other for ever."""
     if count <= THREADS or "NPROC" in os.environ:
         yield
         return

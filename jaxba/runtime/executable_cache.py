@@ -125,8 +125,7 @@ class ExecutableCache:
 def watch_compilation() -> Iterator[Callable[[], bool]]:
     """Gives a function that tells whether this thread has compiled a program within the context.
 
-    False where JAX read the program from its own cache instead.
-    """
+    False where JAX read the program from its own cache instead."""
     thread, events = threading.get_ident(), set()
 
     def listen(event: str, *_: Any, **__: Any) -> None:

@@ -29,8 +29,7 @@ def fusion_barrier(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
 
     Without it XLA fuses the rotation of a camera into the gather for its observations, and takes its sine once per
     observation. On a CPU `optimization_barrier` is dropped before fusion, so there an exact product with the unit
-    matrix stands in for it: products are never fused. A non-finite entry spoils its column.
-    """
+    matrix stands in for it: products are never fused. A non-finite entry spoils its column."""
     times_identity = lambda rows: jnp.matmul(jnp.eye(len(rows), dtype=rows.dtype), rows, precision="highest")
     return lax.platform_dependent(rows, cpu=times_identity, default=lax.optimization_barrier)
 
@@ -57,8 +56,7 @@ def computed_after(dependency: Array, value: Array) -> Array:
 
     For two batched LAPACK calls that do not need each other: XLA on a CPU runs them side by side, each waits for the
     threads that the other holds, and with two threads a solve deadlocks (jax 0.10.2; random clusters on 333 cameras).
-    Zero times a float is not folded away. A first entry of `dependency` that is not finite makes `value` NaN.
-    """
+    Zero times a float is not folded away. A first entry of `dependency` that is not finite makes `value` NaN."""
     return value + 0 * jnp.ravel(dependency)[0]
 
 

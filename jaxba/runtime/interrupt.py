@@ -34,8 +34,7 @@ class Interrupt:
     Nothing is changed in a thread other than the first, where signals are not handled.
 
     With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a compiled
-    program the first one prints a message, and the second ends the process: files are atomic.
-    """
+    program the first one prints a message, and the second ends the process: files are atomic."""
 
     status = 0
     """Exit status after the signal that came last; 0 before any."""

@@ -54,8 +54,7 @@ def _are_known(options: Options) -> bool:
 class jit:
     """`jax.jit`, compiled with `right_options`.
 
-    JAX takes options for whole programs: what is called inside another one, or a transformation, has its options.
-    """
+    JAX takes options for whole programs: what is called inside another one, or a transformation, has its options."""
 
     def __init__(self, function: Callable[..., Any], *, once: bool = False, **settings: Any) -> None:
         """`function` is what it computes, `settings` are those of `jax.jit`. What runs `once` is hardly optimised."""

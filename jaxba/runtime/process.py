@@ -118,8 +118,7 @@ def single_blas_thread() -> Iterator[None]:
     """A context in which BLAS uses one thread. Contexts of several threads may overlap.
 
     XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call and take the
-    processor from XLA's own threads; beside another busy process an iteration became ten times slower.
-    """
+    processor from XLA's own threads; beside another busy process an iteration became ten times slower."""
     global _blas_users, _blas_limit
     with _blas_lock:
         if not _blas_users:

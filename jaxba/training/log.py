@@ -21,8 +21,7 @@ Row = dict[str, Any]  # metrics of one chunk by name; None if not finite
 class Log:
     """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones.
 
-    The calling thread writes TensorBoard's files: that of tensorboardX ends on a full disk, waited for for ever.
-    """
+    The calling thread writes TensorBoard's files: that of tensorboardX ends on a full disk, waited for for ever."""
 
     def __init__(self, folder: Path, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
         """Opens the log of a run of which so many chunks are done; `report` is called with a line of text if damaged

@@ -33,8 +33,7 @@ class MLP(nn.Module):
     """Hidden layers of one width with ReLU, and a linear last layer with small initial weights.
 
     With `layer_norm` each hidden layer is normalised before its ReLU, without learned scale and shift, which the next
-    layers have: an update of width 64 takes a tenth less time. Source: Ba et al. 2016; in critics Ball et al. 2023.
-    """
+    layers have: an update of width 64 takes a tenth less time. Source: Ba et al. 2016; in critics Ball et al. 2023."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -94,8 +93,7 @@ class Actor(nn.Module):
     """Mean and logarithm of the standard deviation of the pre-tanh action.
 
     The logarithm is bounded by a sigmoid, whose gradient never vanishes as that of a clip does. It is zero where the
-    network's output is zero, so that an untrained policy is spread over all of (-1, 1).
-    """
+    network's output is zero, so that an untrained policy is spread over all of (-1, 1)."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -127,8 +125,7 @@ def log_probability(
     """Log density of `u = tanh(x)`, nats, for `x = mean + exp(log_std) noise`.
 
     `log N(x) - log(1 - u^2)` with `log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x))`, which neither overflows nor
-    cancels for large `x`. Source: Haarnoja et al. 2018, appendix C; the stable form is TensorFlow Probability's.
-    """
+    cancels for large `x`. Source: Haarnoja et al. 2018, appendix C; the stable form is TensorFlow Probability's."""
     normal = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
     log_det = 2 * (math.log(2) - pre_tanh - jax.nn.softplus(-2 * pre_tanh))
     return jnp.sum(normal - log_det, axis=-1)
