@@ -83,7 +83,13 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         elif not before:
             break
     if len(linked) < 2 or not before:
-        _fail(sequence, options, linked[-1], {k: len(matches[i, k]) for i, k in matches if i == linked[-1]})
+        number, last = sequence.numbers, linked[-1]
+        counts = sorted((k, len(found)) for (i, k), found in matches.items() if i == last)
+        shares = ", ".join(f"{count} with frame {number[k]}" for k, count in counts)
+        raise ProblemError(
+            f"too few matches: frame {number[last]} shares {shares}, at least {options.min_matches} are needed; "
+            f"choose other --frames, more --keypoints or fewer --min-matches"
+        )
     position = {frame: at for at, frame in enumerate(linked)}
     strong = {
         (position[i], position[j]): found
@@ -91,12 +97,3 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         if i in position and j in position and len(found) >= options.min_matches
     }
     return join_matches([pixels[i] for i in linked], strong), tuple(linked)
-
-
-def _fail(sequence: Sequence, options: Build, frame: int, counts: dict[int, int]) -> None:
-    number = sequence.numbers
-    shares = ", ".join(f"{count} with frame {number[j]}" for j, count in sorted(counts.items()))
-    raise ProblemError(
-        f"too few matches: frame {number[frame]} shares {shares}, at least {options.min_matches} are needed; "
-        f"choose other --frames, more --keypoints or fewer --min-matches"
-    )

@@ -181,36 +181,31 @@ class _Run:
 
     def _restore_latest(self, like: Any) -> None:
         """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
-        (self.chunk, self.wall_s, self.evaluated, best), arrays = self._read_latest(like)
-        self.state = checkpoint.unpack(arrays, {"state": like})["state"]
-        if best:
-            host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
-            actors = checkpoint.unpack(arrays, {"best": host})["best"]
-            self.best = tuple(Best(_agent(actors, k), agent=k, **one) for k, one in enumerate(best))
-
-    def _read_latest(self, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
         reasons = []
         for step in reversed(checkpoint.steps(self.folder)):
             try:
-                metadata, arrays = self._read(step, like)
+                self._restore(step, like)
             except TrainError as error:
                 reasons.append(str(error))
                 continue
             if reasons:
-                self.hooks.note(f"{reasons[0]}; going on from the one before, after chunk {metadata[0]}")
-            return metadata, arrays
+                self.hooks.note(f"{reasons[0]}; going on from the one before, after chunk {self.chunk}")
+            return
         others = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise TrainError(f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder")
 
-    def _read(self, step: int, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
+    def _restore(self, step: int, like: Any) -> None:
         arrays, metadata = checkpoint.restore(self.folder, step)
         try:
-            found = [metadata[name] for name in _METADATA]
-            best = [Best(None, agent=k, **one) for k, one in enumerate(found[-1])]
+            self.chunk, self.wall_s, self.evaluated, best = (metadata[name] for name in _METADATA)
+            found = [Best(None, agent=k, **one) for k, one in enumerate(best)]
         except (KeyError, TypeError) as error:
             raise TrainError(f"checkpoint {step} was written by another version: {error}") from None
-        checkpoint.check(arrays, {"state": like, **({"best": like.learner.actor} if best else {})})
-        return found, arrays
+        self.state = checkpoint.unpack(arrays, {"state": like})["state"]
+        if found:
+            host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
+            actors = checkpoint.unpack(arrays, {"best": host})["best"]
+            self.best = tuple(one._replace(actor=_agent(actors, one.agent)) for one in found)
 
     def _save(self) -> None:
         arrays = checkpoint.pack({"state": self.state})

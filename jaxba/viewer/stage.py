@@ -144,7 +144,11 @@ class Stage:
         points, poses = similarity.points(np.asarray(problem.points)), similarity.poses(camera_poses(problem.cameras))
         with self._server.atomic():
             kept = self.kept()
-            layers.cloud("points", points[kept], self._colours()[kept], self.point_size)
+            name = TRACK if self.colour == TRACK else ERROR
+            of_points = colours(self._values()[name], *self.limits[name])
+            if self.colour == FILE and self._file_colours is not None:
+                of_points = self._file_colours
+            layers.cloud("points", points[kept], of_points[kept], self.point_size)
             shown = set(self.frusta.tolist()) | ({self.chosen} if self.chosen is not None else set())
             of_image = colours(measures.of_image, *self.limits[IMAGE])
             for camera in sorted(shown):
@@ -168,12 +172,6 @@ class Stage:
             for number, segments in enumerate(geometry.row_segments(problem)):
                 ends = similarity.points(segments.reshape(-1, 3)).reshape(-1, 2, 3)
                 layers.lines(f"rows {number}", ends, KINDS[number % len(KINDS)], 1.0)
-
-    def _colours(self) -> np.ndarray:
-        if self.colour == FILE and self._file_colours is not None:
-            return self._file_colours
-        name = TRACK if self.colour == TRACK else ERROR
-        return colours(self._values()[name], *self.limits[name])
 
     def _values(self) -> dict[str, np.ndarray]:
         found = self.measures
