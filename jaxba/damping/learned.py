@@ -24,8 +24,7 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 class AgentPolicy(ABC):
     """What policies of an agent share: they observe, choose an action, and get the lambda that the guard allows."""
 
-    config: AgentConfig
-    """What is observed, what an action means, and the step that the policy is made for."""
+    config: AgentConfig  # what is observed, what an action means, and the step that the policy is made for
 
     @abstractmethod
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
@@ -60,11 +59,8 @@ class ConstantAction(AgentPolicy):
 
     The best constant action of a game is the baseline that training has to beat."""
 
-    action: tuple[float]
-    """In [-1, 1]."""
-
-    config: AgentConfig = field(metadata={"static": True})
-    """What the action means."""
+    action: tuple[float]  # in [-1, 1]
+    config: AgentConfig = field(metadata={"static": True})  # what the action means
 
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
         """The action, whatever the observation."""

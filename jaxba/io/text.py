@@ -67,12 +67,9 @@ class Text:
     def __init__(self, text: bytes, name: str):
         """`text` of the file called `name`, with lines that end in LF."""
         self.name = name
-        self.line = 0
-        """Number of the line that was read last, from 1."""
-        self.values = np.empty(0)
-        """The numbers, up to the first word that is none."""
-        self.field: Callable[[int], str]
-        """What the number at an ordinal is, such as "number of cameras"; may be replaced while reading."""
+        self.line = 0  # number of the line that was read last, from 1
+        self.values = np.empty(0)  # the numbers, up to the first word that is none
+        self.field: Callable[[int], str]  # what the number at an ordinal is; may be replaced while reading
         self._text, self._at = text, 0  # where the next line begins
         self._blocks: list[tuple[int, int]] = []  # of each block the ordinal of its first number, and where it begins
         self._complaint: str | None = None  # about the word after the last number

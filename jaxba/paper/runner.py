@@ -89,8 +89,7 @@ class Runner:
         something starts. Raises ProblemError: a file of results is damaged."""
         self.config, self.folder, self.report = config, folder, report
         self.store = Store(folder)
-        self.done = 0
-        """Number of solves, plays and trainings that this process has done."""
+        self.done = 0  # solves, plays and trainings of this process
         self._read: tuple[Source, BundleProblem] | None = None
 
     def agent(

@@ -48,11 +48,9 @@ _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields
 class ZeroNet(AgentPolicy):
     """A damping policy: a ReLU network from the last states, actions and rewards to one action."""
 
-    layers: tuple[Layer, ...]
-    """Hidden layers, then the output layer, whose tanh is the action."""
-
+    layers: tuple[Layer, ...]  # hidden layers, then the output layer, whose tanh is the action
+    # length of the history and range of lambda; must have the observation `paper` and no guard
     config: AgentConfig = field(metadata={"static": True})
-    """Length of the history and range of lambda; must have the observation `paper` and no guard."""
 
     def act(self, memory: Memory) -> Float[Array, ""]:
         """The action in (-1, 1)."""

@@ -133,12 +133,11 @@ class ColmapProblem:
         self._manifolds = (pose_manifold(), pyceres.SubsetManifold(LENS_SIZE, list(PRINCIPAL_POINT)))
         self._costs: list[Any] = [None] * problem.num_observations
         self._residuals: list[Any] = [None] * problem.num_observations
+        # whether the cost function of an observation is the one in Python, shape `(observations,)`
         self.in_python = geometry.depths(problem) < SMALLEST_DEPTH
-        """Whether the cost function of an observation is the one in Python, shape `(observations,)`."""
         for observation, behind in enumerate(self.in_python):
             self._add_observation(observation, TwoSidedReprojection if behind else reprojection)
-        self.observing = np.unique(problem.camera_index)
-        """Cameras that have observations."""
+        self.observing = np.unique(problem.camera_index)  # cameras that have observations
         for camera in self.observing:
             self.ceres.set_manifold(self._poses[camera], self._manifolds[0])
             self.ceres.set_manifold(self._lenses[camera], self._manifolds[1])

@@ -123,15 +123,13 @@ class ParallelCompilation:
     arguments that it was given first."""
 
     def __init__(self) -> None:
-        self.loaded: dict[Program, CachedExecutable] = {}
-        """Programs that were read from disk."""
+        self.loaded: dict[Program, CachedExecutable] = {}  # programs that were read from disk
         self._verified: set[Program] = set()  # of these, the ones that have run once
         # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
         # disk, which are bound to a device
         self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
-        self.late_s = 0.0
-        """Seconds in which `run` has compiled programs that nobody had asked for before."""
+        self.late_s = 0.0  # seconds in which `run` has compiled programs that nobody had asked for before
 
     def __enter__(self) -> ParallelCompilation:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))

@@ -36,8 +36,7 @@ class Interrupt:
     With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a compiled
     program the first one prints a message, and the second ends the process: files are atomic."""
 
-    status = 0
-    """Exit status after the signal that came last; 0 before any."""
+    status = 0  # exit status after the signal that came last; 0 before any
 
     def __init__(self, unit: str = "", *, graceful: bool = False) -> None:
         """Does nothing yet. `unit` is what is finished after the first signal, for the message, e.g. `iteration`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,16 +18,13 @@ LARGEST_INTEGER = 2**53  # whole numbers below it are exact as float64
 _SHOWN = 40  # characters of a bad value in a message
 
 
+@dataclass(slots=True)
 class Record:
     """A value of a JSON file, and how messages call it. Numbers may be texts, as AliceVision writes them."""
 
-    __slots__ = ("name", "value", "where")
-
-    def __init__(self, value: Any, name: str, where: str = ""):
-        """Wraps `value` of the file called `name`."""
-        self.value = value
-        self.name = name
-        self.where = where
+    value: Any
+    name: str  # of the file
+    where: str = ""  # in it
 
     def fail(self, complaint: str) -> NoReturn:
         """Raises a `ProblemError` about this value."""
