@@ -38,9 +38,7 @@ _ROWS = (
 _STEPS = "<b>%{fullData.name}</b> %{y:.3g} % of the problems within %{x:.3g} times<extra></extra>"
 _POINT = "<b>%{fullData.name}</b> %{y:.4g} at %{x:.4g}<extra></extra>"
 
-Values: TypeAlias = Sequence[Any] | Mapping[str, Sequence[Any]]
-"""Numbers of the points of a line, or by what is on x. NaN is a gap."""
-
+Values: TypeAlias = Sequence[Any] | Mapping[str, Sequence[Any]]  # of a line's points, or by what is on x; NaN is a gap
 Chart: TypeAlias = dict[str, Any]  # title, note, traces, layout, and the x axis of every position of the switch
 
 

@@ -24,12 +24,8 @@ from jaxba.solver.record import Record
 ITERATION_LIMIT = 100  # a solve that has not converged within this many iterations is a failure. Source: the paper
 PAPER_TOLERANCES = (0.1, 0.001)  # values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures
 RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)  # values of epsilon in the target `f <= f*(1 + epsilon)`
-
-ZERO_RESIDUAL_FLOOR = 1e-12
-"""Costs up to f* plus this times f0 satisfy every relative tolerance, since f* may be rounding error (1e-26)."""
-
-INITIAL_COST_TOLERANCE = 1e-2
-"""Relative difference of initial costs above which two solvers had different starts. Source: rootba."""
+ZERO_RESIDUAL_FLOOR = 1e-12  # costs to f* plus this times f0 are within every tolerance, as f* may be rounding (1e-26)
+INITIAL_COST_TOLERANCE = 1e-2  # relative difference of costs above which two solvers started elsewhere. Source: rootba
 
 COST_DEFINITION_TOLERANCE = 1e-5
 """Relative difference of initial costs above which rounding cannot be the reason. float32 makes about 1e-6; ignoring

@@ -5,8 +5,7 @@ from pathlib import Path
 from jaxba.io import read_bal
 from jaxba.problem.bundle_problem import BundleProblem
 
-EXAMPLE = Path(__file__).with_name("example.txt.bz2")
-"""A BAL file of a random street; `tests/datasets/test_example.py` says which."""
+EXAMPLE = Path(__file__).with_name("example.txt.bz2")  # of a random street (tests/datasets/test_example.py)
 
 
 def example_problem() -> BundleProblem:

@@ -46,9 +46,7 @@ RewardFunction = Callable[[StepInfo, Array, Array], Array]
 """Of an iteration, the best known cost of the scene, and whether the episode has ended in success."""
 
 DISTANCE_FLOOR = 1e-6  # relative distance to the best known cost that a critic does not distinguish from zero
-
-BONUS_DECAY = 0.01
-"""Fraction of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023."""
+BONUS_DECAY = 0.01  # fraction of the bonus lost in an iteration under `reduction`. Source: Belder et al. 2023
 
 
 @dataclass(frozen=True)

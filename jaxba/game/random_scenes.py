@@ -30,10 +30,7 @@ points. `windows`: not random, but cut from real problems (game/windows.py)."""
 MOTIONS = ("forward", "lateral", "orbit", "photos")  # motions of the cameras of a wide scene, equally often
 MIN_VIEWS = 5  # cameras with fewer observations are removed: nine unknowns need five observations
 NOISE = (0.05, 3.0)  # sigma of a measurement in pixels, log-uniform per scene
-
-OUTLIERS = (0.4, 1e-3, 0.03)
-"""Fraction of the scenes with wrong matches, and smallest and largest fraction of wrong matches in these scenes."""
-
+OUTLIERS = (0.4, 1e-3, 0.03)  # fraction of scenes with wrong matches; smallest and largest fraction of these in them
 OUTLIER_ERROR = (5.0, 100.0)  # largest error of a wrong match in pixels, log-uniform per scene
 FOCAL = (300.0, 4000.0)  # focal length in pixels, log-uniform per scene
 CANDIDATES = 3  # points drawn per point that is kept, since many are seen by one camera only

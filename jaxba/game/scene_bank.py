@@ -39,9 +39,7 @@ PORTFOLIO_FTOL = 1e-7  # relative decrease of an accepted step that ends a rule'
 MIN_RATIO, MAX_RATIO = 1.01, 1e6
 """Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is between 1.04 and 1.1."""
 
-SMALLEST_COST = 1e-9
-"""Smallest best cost per observation of a usable scene, pixels squared: below, rounding errors dominate."""
-
+SMALLEST_COST = 1e-9  # least best cost per observation of a usable scene, pixels squared: below, rounding dominates
 MIN_OBSERVATIONS = 30  # smallest number of observations of a scene that is solved at all
 
 MAX_ERROR_ANGLE = 0.2
@@ -211,8 +209,7 @@ def make_banks(
     return splits
 
 
-MORE_CLASSES = 2**30
-"""Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (driver.py)."""
+MORE_CLASSES = 2**30  # offset of the random streams of classes but the first from the agents', from 1 on (driver.py)
 
 HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
 """Fraction of usable scenes held out; more up to a number whose mean says something, at most the last one."""

@@ -13,11 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-SHORTEST_TIME = 1e-6
-"""Lower limit in seconds of times in geometric means; a time is 0 where the start satisfies a target."""
-
-RESAMPLES = 2000
-"""Bootstrap samples; a bound of an interval moves by a fiftieth of its width from one set of samples to another."""
+SHORTEST_TIME = 1e-6  # least seconds in geometric means of times, which are 0 where the start satisfies a target
+RESAMPLES = 2000  # bootstrap samples; a bound of an interval moves by a fiftieth of its width between two sets
 
 
 class Reached(NamedTuple):

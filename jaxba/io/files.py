@@ -22,8 +22,7 @@ StrPath: TypeAlias = str | os.PathLike[str]
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
 """Errors of reading and decompressing a file that are the fault of the file, not of this program."""
 
-STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")
-"""Names of open streams; links to files where a shell redirects them."""
+STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")  # open streams; links to files where a shell redirects them
 
 _DESCRIPTORS = {"/dev/stdout": 1, "/dev/stderr": 2}
 

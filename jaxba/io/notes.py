@@ -17,8 +17,7 @@ EDGE = 0.1
 """Share of the width or height of an image: a principal point as near to the border, or outside, is implausible. Those
 of real lenses lie within a few percent of the middle; 0 is that of a calibration left empty, or of another origin."""
 
-LEAST_PIXELS = 16
-"""Observations that must lie on one side of the origin before that is remarkable; with fewer it may be chance."""
+LEAST_PIXELS = 16  # observations that must lie on one side of the origin for a note; with fewer it may be chance
 
 
 def report(notes: Iterable[str], *, strict: bool = False) -> None:

@@ -11,9 +11,7 @@ from jaxba.kitti.triangulate import Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 
-FLIP = np.diag(COLMAP_FLIP)
-"""From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""
-
+FLIP = np.diag(COLMAP_FLIP)  # from axes x right, y down, z forward (KITTI, COLMAP) to x right, y up, z backward (BAL)
 MIN_OBSERVATIONS = 10  # observations that a camera needs: 20 residuals for its 9 parameters
 
 

@@ -19,8 +19,7 @@ from jaxba.kitti.tracks import Tracks, choose, join_matches
 from jaxba.kitti.triangulate import views_of_poses
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-Report = Callable[[str, int, int], None]
-"""Called with the name of a stage, how much of it is done, and how much there is."""
+Report = Callable[[str, int, int], None]  # called with a stage, how much of it is done, and how much there is
 
 
 def build(

@@ -15,9 +15,7 @@ from jaxba.problem.bundle_problem import ProblemError
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
 GREY_BITS = 8  # bits per pixel of the images in which key-points are detected
-
-Reader = Callable[[int], np.ndarray]
-"""Grey image of a frame by its position in the sequence, shape (height, width), uint8."""
+Reader = Callable[[int], np.ndarray]  # grey image of a frame by its position, shape (height, width), uint8
 
 
 def image_reader(sequence: Sequence) -> Reader:

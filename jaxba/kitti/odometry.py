@@ -22,16 +22,10 @@ from jaxba.kitti.triangulate import Observations, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
 
 BOOTSTRAP_ANGLE = 2.0  # median angle in degrees between the rays of the first two views that is enough
-
-BOOTSTRAP_MOST = 20.0
-"""... and beyond which the essential matrix must be wrong: the points would be nearer than three baselines."""
-
+BOOTSTRAP_MOST = 20.0  # ... beyond which the essential matrix must be wrong: points nearer than three baselines
 BOOTSTRAP_ENOUGH = 5.0  # angle beyond which a pair of views is not rated higher
 BOOTSTRAP_SHARE = 0.5  # share of the common tracks that must fit the motion: a wrong motion fits few of them
-
-BOOTSTRAP_LEAST = 0.5
-"""... and the least angle, where no pair has more. Noise of a pixel is 0.1 degrees at KITTI's focal length."""
-
+BOOTSTRAP_LEAST = 0.5  # ... and the least angle, where no pair has more; noise of a pixel is 0.1 degrees on KITTI
 BOOTSTRAP_REACH = 12  # how many views after the first are tried as second ones
 MIN_POINTS = 15  # inlier points that the pose of a view needs, and that the first two views must give
 PNP_PIXELS = 3.0  # reprojection error of an outlier

@@ -27,11 +27,8 @@ from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.frames import Calibration, lines_of, numbers_of
 from jaxba.problem.bundle_problem import ProblemError
 
-FILES = ("calib.txt", "K.txt", "calib_cam_to_cam.txt", "perspective.txt")
-"""Names of the files, in the order in which they are searched."""
-
-ABOVE = ("calib_cam_to_cam.txt",)
-"""Those that are also searched in the folder above: KITTI's raw data have one file for all drives of a day."""
+FILES = ("calib.txt", "K.txt", "calib_cam_to_cam.txt", "perspective.txt")  # in the order of the search
+ABOVE = ("calib_cam_to_cam.txt",)  # also searched in the folder above: raw data have one for all drives of a day
 
 
 def calibration_files(folder: Path) -> list[Path]:

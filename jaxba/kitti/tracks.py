@@ -105,9 +105,7 @@ def _components(count: int, edges: Sequence[np.ndarray]) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-PARALLAX = 10.0
-"""Median parallax in pixels of a key-frame of `auto`. VINS-Mono (Qin et al. 2018): 10 at focal length 460."""
-
+PARALLAX = 10.0  # median parallax of a key-frame of `auto`, pixels. VINS-Mono (Qin et al. 2018): 10 at focal length 460
 SHARE = 0.5  # ... as it does when less than this share of the tracks of the last key-frame is left
 MIN_SHARED = 20  # tracks that neighbouring key-frames must share, to estimate their relative pose
 

@@ -35,9 +35,7 @@ from jaxba.typing import InputError
 
 LIMIT = profile.ITERATION_LIMIT
 
-ELSEWHERE, CONSTANT = "-elsewhere", "-constant"
-"""Endings of the names of agents that are trained on other real problems, and of twins without learning."""
-
+ELSEWHERE, CONSTANT = "-elsewhere", "-constant"  # agents trained on other real problems, and untrained twins
 TEST = "test"  # name of the scenes of the tables in records
 SMALL = "small"  # family of the small random scenes
 

@@ -31,9 +31,7 @@ pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # a failed fact
 
 POSE_SIZE, LENS_SIZE = 7, 5  # numbers of parameters of a pose and of a RADIAL camera
 PRINCIPAL_POINT = (1, 2)  # indices of cx and cy among the parameters of a RADIAL camera
-
-SMALLEST_DEPTH = float(np.finfo(np.float64).eps)
-"""COLMAP sets the residual of a point to zero if its depth is smaller than this."""
+SMALLEST_DEPTH = float(np.finfo(np.float64).eps)  # below it COLMAP sets a point's residual to zero
 
 
 def backend(mode: str) -> str:

@@ -45,11 +45,8 @@ from jaxba.solver.place import Placed
 from jaxba.solver.solve import Solution
 from jaxba.structure.layout import Layout, build_layout
 
-LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
-"""Limits of the radius, so wide that they do not change the lambda of any policy."""
-
-FORCED_DECREASE = 1e200
-"""Decrease of the cost by `_AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate."""
+LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300  # so wide that they change the lambda of no policy
+FORCED_DECREASE = 1e200  # of the cost by `_AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate
 
 _advance, _begin = jit(advance), jit(begin)
 

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import BinaryIO
 
-TEMPORARY = ".jaxba-{}.tmp"
-"""Name of a file that is being written. Hidden, and short, so that every name that a folder takes may be written."""
+TEMPORARY = ".jaxba-{}.tmp"  # a file being written: hidden, and short, since the name of the file may be the longest
 
 
 @contextmanager

@@ -27,13 +27,8 @@ T = TypeVar("T")
 
 START_S = 300  # seconds that processes wait for each other at the start. JAX's default
 PATIENCE_S = 5  # seconds after which a process says that it waits for others at the start
-
-HEARTBEAT_S = 30
-"""Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
-
-WAIT_MS = 1 << 30
-"""Milliseconds, twelve days, that processes wait for the first one. Gloo's collectives wait half an hour."""
-
+HEARTBEAT_S = 30  # seconds of silence after which a process counts as dead and JAX ends the others; its default is 100
+WAIT_MS = 1 << 30  # twelve days, for which processes wait for the first one; Gloo's collectives wait half an hour
 THREADS = 8  # of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill
 
 LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")

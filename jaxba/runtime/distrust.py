@@ -25,9 +25,7 @@ from jaxba.runtime.jit import jit
 
 FLAG = "--xla_cpu_max_isa"
 
-COMPLAINT = b"doesn't match the machine type for execution"
-"""What XLA writes to standard error, and no function returns."""
-
+COMPLAINT = b"doesn't match the machine type for execution"  # what XLA writes to standard error alone
 DECISION = "instructions"  # name of the file that says what programs of a folder are compiled for
 
 

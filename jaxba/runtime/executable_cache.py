@@ -142,8 +142,7 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
         monitoring.unregister_event_duration_listener(listen)
 
 
-_readers = ThreadPoolExecutor(max_workers=2)
-"""Read programs, whose machine code takes XLA 0.1 s each, while others are looked for."""
+_readers = ThreadPoolExecutor(max_workers=2)  # read programs, XLA each in 0.1 s, while others are looked for
 
 
 @functools.lru_cache(maxsize=IN_MEMORY)

@@ -15,17 +15,10 @@ from typing import Any
 INTERRUPTED = 128 + signal.SIGINT  # exit status after Ctrl-C, as shells define it
 TERMINATED = 128 + signal.SIGTERM  # exit status after SIGTERM
 ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}  # last line of a command that a signal has ended
-
-SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}
-"""The signals, and what after one of them stops at once."""
-
-EXIT_DELAY_S = 1.0
-"""Seconds from a second signal to the process's end; Python handles none while a compiled program runs."""
-
+SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}  # and what stops at once after one
+EXIT_DELAY_S = 1.0  # seconds from a second signal to the end; Python handles none while a compiled program runs
 RAISE_AGAIN_S = 0.01  # seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended
-
-_HANDLED = 0
-"""Byte that the signal handler sends to the thread when it raises KeyboardInterrupt; no signal has this number."""
+_HANDLED = 0  # byte that the handler sends to the thread when it raises KeyboardInterrupt; no signal's number
 
 
 class Interrupt:

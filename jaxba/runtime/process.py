@@ -24,10 +24,7 @@ from threadpoolctl import ThreadpoolController
 T = TypeVar("T")
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4  # parameter numbers of glibc's mallopt (malloc.h)
-
-MAPPINGS_SHARE = 0.4
-"""Share of the limit of memory mappings at which programs are dropped. Sixteen solvers took a tenth of it."""
-
+MAPPINGS_SHARE = 0.4  # share of the limit of mappings at which programs are dropped; sixteen solvers took a tenth
 GROWTH_SHARE = 0.1  # growth, as such a share, below which they are not dropped again: mappings that are not JAX's stay
 _mappings_left = 0  # mappings that were left when programs were dropped last
 

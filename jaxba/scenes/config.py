@@ -9,11 +9,8 @@ import numpy as np
 
 from jaxba.problem.bundle_problem import ProblemError
 
-Trajectory = Literal["forward", "lateral", "orbit", "photos"]
-"""Arrangement of the cameras; see `SceneConfig.trajectory`."""
-
-VIEW_MARGIN = 1.25
-"""Half-width of the cone in which distortion must be monotone, relative to the image without distortion."""
+Trajectory = Literal["forward", "lateral", "orbit", "photos"]  # arrangement of the cameras, see `SceneConfig`
+VIEW_MARGIN = 1.25  # half-width of the cone of monotone distortion, relative to the image without distortion
 
 
 @dataclass(frozen=True)
@@ -142,8 +139,7 @@ def check(config: SceneConfig) -> None:
 OUTLIER_SHARE, OUTLIER_SIZE = 0.002, 10.0
 """Outliers give BAL's slow convergence: Ceres' rule needs 16 iterations on `ladybug-49` with them, 11 without."""
 
-STREET_DRIFT = 0.3
-"""Times `cameras^-1.5`, the start's drift per camera on a street: its end is then off by 0.2 steps at any length."""
+STREET_DRIFT = 0.3  # times `cameras^-1.5`: a start's drift per camera; a street's end is off by 0.2 steps at any length
 
 
 def _street(cameras: int, points: int, observations: int) -> SceneConfig:

@@ -11,9 +11,7 @@ from jaxba.problem.bundle_problem import CAMERA_SIZE
 from jaxba.problem.geometry import angle_axis, rotation_matrices, translations
 from jaxba.scenes.config import SceneConfig
 
-CORNER_SHARE = 0.4
-"""Part of a street that bends. With 400 cameras in a round the view rotates there by 2.25 degrees per camera."""
-
+CORNER_SHARE = 0.4  # part of a street that bends: with 400 cameras in a round by 2.25 degrees per camera
 FIRST_CORNER = 0.3  # where on its side the path starts, as a part of the side, so that short paths bend too
 ORBIT_WAVE = 0.2  # amplitude of an orbit's height relative to its radius, so that the centres do not lie in a plane
 PHOTO_SPREAD = 0.4  # sigma of the logarithm of a photographer's distance: most stand within a factor of 2

@@ -12,16 +12,9 @@ from jaxba.scenes.tracks import MIN_LENGTH
 from jaxba.scenes.trajectory import Path
 
 BUDGET = 1 << 20  # candidate views handled at once: some 100 MB of temporaries
-
-ATTEMPTS = 24
-"""Attempts to place a point where enough cameras see it; each is nearer to the focus of the view than the last."""
-
-WINDOW = 2.5
-"""Candidate cameras per wanted view: 2, as half do not exist at an end of the path, and more for missed views."""
-
-NEAREST, FARTHEST = 0.5, 2.0
-"""A view nearer than this part of min_depth, or farther than this many times max_depth, does not count."""
-
+ATTEMPTS = 24  # to place a point where enough cameras see it, each nearer to the focus of the view than the last
+WINDOW = 2.5  # candidates per wanted view: 2, as half do not exist at an end of the path, and more for missed views
+NEAREST, FARTHEST = 0.5, 2.0  # parts of min_depth and max_depth between which a view counts
 MIN_VIEWS = 4  # every camera should see so many points: 8 residuals for its 6 degrees of freedom and focal length
 
 

@@ -16,13 +16,9 @@ from flax import linen as nn
 from jax import Array
 from jaxtyping import Float
 
-LAST_LAYER = 3e-3
-"""Bound of the uniform initial weights of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
-
+LAST_LAYER = 3e-3  # bound of uniform initial weights of last layers. Source: Lillicrap et al. 2016 (DDPG), section 7
 LOG_STD_MAX = 2.0  # upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code
-
-LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))
-"""Largest float32 below one; tanh in float32 can round to one."""
+LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))  # the largest below one, to which tanh can round
 
 
 def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:

@@ -10,10 +10,7 @@ from jaxba.training.log import Row
 
 YARDSTICKS = ("ceres", "ceres+embedded", "constant action")  # baselines beside which held-out scores are printed
 MOST_ENTROPY = math.log(2)  # nats of a uniform action in (-1, 1)
-
-RANDOM = 0.1
-"""Nats; a policy of entropy less than this below `MOST_ENTROPY` acts at random: over nine tenths of the range."""
-
+RANDOM = 0.1  # nats below `MOST_ENTROPY` within which a policy acts at random: over nine tenths of the range
 SAME = 0.1  # decades of lambda; a policy with a smaller spread over states does the same in every state
 
 

@@ -16,8 +16,7 @@ from jaxba.problem.geometry import COLMAP_FLIP, camera_centers
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.row_owners import block_groups, owners_of
 
-WIDEST = 2.0
-"""Largest half width of a frustum at distance 1: the tangent of 63 degrees. Fisheyes see more than can be drawn."""
+WIDEST = 2.0  # largest half width of a frustum at distance 1, tangent of 63 degrees: fisheyes see more
 
 
 class Frusta(NamedTuple):

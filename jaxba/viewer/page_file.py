@@ -15,9 +15,7 @@ from jaxba.viewer.stage import ASIDE, Stage
 from jaxba.viewer.words import meaning, numbers, sizes, worst_images
 
 PAGE_POINTS, LISTED = 50_000, 5  # most points on a page in a file, and worst images that it names
-
-FRAME_S, LEFT = 1.0, 0.4
-"""Seconds for which an iteration is shown, and how far the view is moved to the left, where the words are."""
+FRAME_S, LEFT = 1.0, 0.4  # seconds for which an iteration is shown; shift of the view to the left, where the words are
 
 WORDS = """<details open style="position:fixed;left:8px;top:8px;max-width:24em;padding:4px 8px;font:12px sans-serif;
 color-scheme:light dark;background:Canvas;color:CanvasText;opacity:.85;z-index:9"><summary>jaxba</summary>%s</details>

@@ -16,13 +16,9 @@ from jaxba.viewer.measures import Measures, colours, limits, measure
 from jaxba.viewer.recording import evenly
 from jaxba.viewer.sources import Shown
 
-SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500
-"""Most points and cameras on a page. Software rendering draws them at a few frames a second."""
-
+SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500  # most on a page; software rendering draws them at a few frames a second
 POINT_SIZE = 0.006  # of points; scenes have a size of about one
-
-ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)
-"""Distance between the middles of neighbouring stages, and where the name of one of several stands."""
+ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)  # distance between neighbouring stages, and where the name of one of several is
 
 FILE, ERROR, TRACK, IMAGE = "colour of the file", "reprojection error", "track length", "error of images"
 """What colours may mean, the first three those of points."""
@@ -33,8 +29,7 @@ CHOSEN, CHOSEN_SIDE, RESIDUAL = (255, 120, 0), 1600, (208, 0, 0)
 KINDS = ((0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (213, 94, 0))
 """Colours of residuals besides those of pixels. Source: Okabe and Ito 2008, "Color Universal Design"."""
 
-BEFORE, TYPICAL = 0.99, 0.015
-"""Depth of residuals, as a share of that of their image, and the length of the median one, as a share of its width."""
+BEFORE, TYPICAL = 0.99, 0.015  # shares: depth of residuals in their image's, median length in its width
 
 
 class Stage:

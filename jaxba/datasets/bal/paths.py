@@ -18,8 +18,7 @@ from jaxba.datasets import EXAMPLE
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.process import user_cache
 
-FOLDER_VARIABLE = "JAXBA_BAL"
-"""Environment variable: folder of downloaded problems, instead of `bal` in the user's cache folder."""
+FOLDER_VARIABLE = "JAXBA_BAL"  # environment variable: folder of downloaded problems, else `bal` in the user's cache
 
 
 class Entry(NamedTuple):

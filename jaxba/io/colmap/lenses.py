@@ -16,8 +16,7 @@ from jaxba.io.colmap.model import Camera
 from jaxba.problem.camera_models import BAL, CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 
-AS_BAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-"""Camera models that are BAL's but for the principal point and numbers that stay zero."""
+AS_BAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # BAL's but for principal points and zeros
 
 
 def lenses_of(

@@ -21,7 +21,6 @@ from jaxba.problem.camera_models import CAMERA_MODELS
 
 PARTS = ("cameras", "images", "points3D")  # files that every model has
 RIG_PARTS = ("rigs", "frames")  # files that models have since COLMAP 3.12, both or none
-
 _LONGEST_NAME = 60  # of an image in messages
 
 
@@ -42,8 +41,7 @@ KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])  # a key-point: pixels, and
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 """A point, with the number of elements of its track. As in a binary file, where the track follows."""
 
-TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])
-"""An element of a track: id of an image, and index of one of its key-points."""
+TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])  # an element of a track: an image, and which of its key-points
 
 
 @dataclass(frozen=True)

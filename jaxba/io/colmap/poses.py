@@ -16,9 +16,7 @@ from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations, colmap_quaternion
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-Pose = tuple[float, ...]
-"""A transform from the world (of a sensor: from its rig): quaternion wxyz, of any norm, and translation."""
-
+Pose = tuple[float, ...]  # transform from the world (of a sensor: its rig): quaternion wxyz of any norm, translation
 _WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]  # from the order of `jaxba.problem.geometry` to COLMAP's, and back
 _LARGEST_EXPONENT = 500  # squares of larger numbers overflow float64, whose exponents end at 1023
 _SAME = 1e-6  # poses that differ by less, relatively, are the same

@@ -33,8 +33,7 @@ SENSOR_WIDTH = 36.0  # millimetres, where a file does not say. Source: `loadIntr
 PARTS = ("version", "featuresFolders", "matchesFolders", "views", "intrinsics", "poses", "structure")
 """Parts of a file that are read, or say where features are."""
 
-LOCKS = ("scaleLocked", "offsetLocked", "distortionLocked")
-"""Flags of intrinsics that hold a part of them; `locked`, which holds all, is read."""
+LOCKS = ("scaleLocked", "offsetLocked", "distortionLocked")  # flags that hold parts; `locked`, of all, is read
 
 _PROGRAM = "AliceVision"
 

@@ -27,14 +27,12 @@ from jaxba.problem.intrinsics import Lenses
 BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 """Coefficients of the two kinds of distortion, in the order in which OpenMVG and AliceVision write them."""
 
-UNDEFINED = 2**32 - 1
-"""Number that stands for no pose or no intrinsic. Source: `UndefinedIndexT` in types.hpp of both programs."""
+UNDEFINED = 2**32 - 1  # stands for no pose or no intrinsic. Source: `UndefinedIndexT` in types.hpp of both programs
 
 Pose = tuple[Float[np.ndarray, "3 3"], list[float]]
 """Rotation and centre of a camera whose frame is `rotation (X - center)`, x to the right, y down, z forward."""
 
-Landmark = tuple[list[float], list[int], list[list[float]]]
-"""A point: its position, the numbers of its views, and their pixels."""
+Landmark = tuple[list[float], list[int], list[list[float]]]  # position of a point, numbers of its views, their pixels
 
 
 @dataclass(frozen=True)

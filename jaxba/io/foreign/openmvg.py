@@ -30,11 +30,8 @@ MODELS = {
 PRIORS = {"use_pose_center_prior": "priors of positions", "use_pose_rotation_prior": "priors of rotations"}
 """What views may hold besides, and the flags that say so. Source: OpenMVG, sfm/sfm_view_priors_io.cpp."""
 
-PARTS = (VERSION, "root_path", "views", "intrinsics", "extrinsics", "structure")
-"""Parts of a file that are read, or say where images are."""
-
-_FIRST = 1 << 31
-"""Bit of a number that marks the first coming of a class or an object. Source: cereal, `detail::msb_32bit`."""
+PARTS = (VERSION, "root_path", "views", "intrinsics", "extrinsics", "structure")  # what is read, or known
+_FIRST = 1 << 31  # bit that marks the first coming of a class or an object. Source: cereal, `detail::msb_32bit`
 
 _PROGRAM = "OpenMVG"
 

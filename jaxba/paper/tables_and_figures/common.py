@@ -18,9 +18,7 @@ from jaxba.paper.results import Row
 from jaxba.paper.runner import TEST, Method, Runner, method_named
 from jaxba.solver.record import Record
 
-CLASSIC, CERES = "classic", "ceres"
-"""Names of the rules with which every table compares: the paper's baseline and Ceres' rule."""
-
+CLASSIC, CERES = "classic", "ceres"  # rules with which every table compares: the paper's baseline and Ceres'
 SCENES = Problems("synthetic", ())  # stands for the synthetic scenes, which are played and not solved one by one
 _SECTIONS = Path(__file__).parents[1].joinpath("texts.md").read_text(encoding="utf-8").split("\n## ")[1:]
 TEXTS = {
