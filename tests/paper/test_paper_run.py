@@ -79,7 +79,7 @@ def runs(capsys) -> int:
 @pytest.mark.slow
 def test_one_table_in_an_empty_folder(finished):
     plays = [json.loads(line) for line in (finished / PLAYS).read_text().splitlines()]
-    trained = ["agent-printed", "agent", "agent-guarded", "agent-guarded-constant"]
+    trained = ["agent-printed", "agent", "agent-constant", "agent-guarded", "agent-guarded-constant"]
     assert [(p["method"], p["seed"]) for p in plays] == [(name, 0) for name in ("classic", "ceres", *trained)]
     assert len({len(p["iterations"]) for p in plays}) == 1
     text = (finished.parent / "docs" / "paper.md").read_text()
