@@ -61,13 +61,14 @@ def cluster_layout(
 
     Clusters have whole frames. They are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`. The
     other shards of a problem (`agreement`) have the same clusters."""
-    from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
+    from jaxba.structure.agglomeration import agglomerate, joined, shared_points  # SciPy: its import takes 0.2 s
 
     camera, point, cameras = observations.camera, observations.point, observations.num_cameras
-    points, frames, lenses = len(observations.tracks), unknowns.poses, unknowns.lenses
+    points, frames, lenses = len(observations.tracks), unknowns.poses.distinct, unknowns.lenses
+    frame = np.asarray(unknowns.poses.index)
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
-    shared = agreement.total("shared points", shared_points(frames.index[camera], point, frames.distinct, points)[0])
-    label = agglomerate(shared, frames.distinct, num_clusters)[frames.index]
+    shared = agreement.total("shared points", shared_points(frame[camera], point, frames, points)[0])
+    label = agglomerate(shared, frames, num_clusters)[frame]
     of_lens = np.where(np.isin(lenses.index, lenses.owners), lenses.index, cameras)
     parts, split = np.unique(label * (cameras + 1) + of_lens, return_inverse=True)
     if len(parts) <= 2 * MAX_CLUSTERS:
@@ -91,18 +92,8 @@ def cluster_layout(
         levels=sum_tree(slots.slot[order], counts, slots.empty, width, agreement=agreement.within("slots")),
         point=slots.point[first_slots],
         pairs=pair_layout(*keyed, factor=True, banded=False, agreement=agreement.within("pairs")),
-        ties=tuple(_tied(label, clusters, sharing) for sharing, _ in unknowns.parts),
+        ties=tuple(Sharing.of(joined(label, np.asarray(sharing.index))) for sharing, _ in unknowns.parts),
     )
-
-
-def _tied(label: Int[np.ndarray, " cameras"], clusters: int, sharing: Sharing) -> Sharing:
-    """Clusters with an unknown in common, also by way of others, are one: one change of all their cameras is in the
-    range of T (structure/unknowns.py)."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    has = csr_matrix((np.ones(len(label)), (label, sharing.index)), shape=(clusters, sharing.distinct))
-    return Sharing.of(connected_components(has @ has.T, directed=False)[1])
 
 
 def cluster_members(
