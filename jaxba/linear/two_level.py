@@ -5,10 +5,12 @@
 Conjugate gradients are slow on long sequences because of smooth deformations with small eigenvalues: neighbouring
 cameras and their points move together, and residuals hardly change. P spans such motions with seven columns per cluster
 for a similarity (rotation a, translation b, scale s), and one for a common change of each number of the lenses. All
-clusters that share a lens have the columns of its numbers in common.
+clusters that share a lens have the columns of its numbers in common, and those with cameras of one frame their motion:
+P is in the range of T (structure/unknowns.py).
 
-A similarity of cameras and points together changes no residual, so that `J_c P = -J_p [a x X, b, s X]`: the columns of
-`S P` follow from the point Jacobians.
+A similarity of cameras and points together changes no pixel, so that `J_c P = -J_p [a x X, b, s X]`: the columns of
+`S P` follow from the point Jacobians. Where poses are constant, frames have offsets or there are other residuals, this
+does not hold, and they are computed from the camera Jacobians.
 
 Source: additive two-level Schwarz with a Nicolaides coarse space (Toselli and Widlund 2005, section 3); Jian, Balcan
 and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with subgraphs and clusters instead.
@@ -19,13 +21,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.cholesky import factor_panels
 from jaxba.linear.formed import dense_blocks, pair_products
-from jaxba.linear.schur import DampedSystem
+from jaxba.linear.schur import DampedSystem, coupling_rows
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.rotations import rotation_matrix
 from jaxba.runtime.fusion import compute_unfused
@@ -70,8 +71,8 @@ def coarse_preconditioner(system: DampedSystem) -> Callable[[Array], Array]:
     """The product with `P (P^T S P)^-1 P^T`; zero if the coarse system is not positive definite."""
     clusters = system.layout.part("clusters")
     modes = camera_modes(system.layout, system.parameters[0], system.cameras.blocks.shape[-1])
-    apart = Sharing.of(np.arange(len(clusters.members)))
-    tied = Sharing.joined((apart, SIMILARITY), (clusters.lenses, modes.shape[-1] - SIMILARITY))
+    sizes = [SIMILARITY, *(size for _, size in system.layout.unknowns.parts[1:])]
+    tied = Sharing.joined(*zip(clusters.ties, sizes, strict=True))
     matrix = tied.merged(coarse_system(system, modes))
     diagonal = jnp.diagonal(matrix)
     scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
@@ -95,7 +96,8 @@ def coarse_system(
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
     clusters, count = system.layout.part("clusters"), modes.shape[-1]
-    shared = sum_over_devices(system.layout, pair_products(clusters.pairs, _shared_rows(system), count))
+    coupling = _similar_rows(system) if _follow_similarities(system.layout) else _coupling_rows(system, modes)
+    shared = sum_over_devices(system.layout, pair_products(clusters.pairs, coupling, count))
     own = jnp.einsum("cam,cab,cbn->cmn", modes, system.cameras.blocks, modes).reshape(-1, count**2)
     own = cluster_sum(clusters, own)
     own = jnp.concatenate([own, jnp.zeros((1, count**2), own.dtype)])
@@ -109,11 +111,25 @@ def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Flo
     return jnp.sum(take_rows(padded, clusters.members), axis=1)
 
 
-def _shared_rows(system: DampedSystem) -> Float[Array, "coarse rows"]:
-    """`(J_c P)^T Q`, transposed and flattened, summed over the observations of each point by each cluster.
+def _follow_similarities(layout: Layout) -> bool:
+    """Whether a similarity of cameras and points changes no residual, cluster by cluster."""
+    unknowns = layout.unknowns
+    return unknowns.free.everywhere and not unknowns.in_rigs and not layout.residuals
 
-    These observations have the point X in common, so that only `J_p^T Q` and the columns of the lenses are summed.
-    """
+
+def _coupling_rows(system: DampedSystem, modes: Float[Array, "cameras width modes"]) -> Float[Array, "coarse rows"]:
+    """`P^T Y`, transposed and flattened, summed over the observations of each point by each cluster."""
+    motions = modes[:, :POSE_SIZE, :SIMILARITY]
+    at_slot = take_rows(motions.reshape(len(motions), -1), system.layout.slot_camera).reshape(-1, *motions.shape[1:])
+    coupling = coupling_rows(system).reshape(-1, 3, modes.shape[1])
+    moved = jnp.einsum("nia,nam->nim", coupling[:, :, :POSE_SIZE], at_slot)
+    rows = jnp.concatenate([moved, coupling[:, :, POSE_SIZE:]], axis=2)
+    return tree_sum(rows.reshape(-1, 3 * modes.shape[2]), system.layout.part("clusters").levels)
+
+
+def _similar_rows(system: DampedSystem) -> Float[Array, "coarse rows"]:
+    """The same where modes change no residual, `J_c P = -J_p [a x X, b, s X]`. The observations have the point X in
+    common, so that only `J_p^T Q` and the columns of the lenses are summed."""
     clusters, linear = system.layout.part("clusters"), system.linear
     over, under = system.points.projected
     (first, second), (high, low) = linear.point_jacobian, linear.camera_jacobian

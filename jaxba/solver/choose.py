@@ -49,6 +49,10 @@ INEXACT_ITERATIONS = 1.2
 """Iterations to convergence with truncated conjugate gradients, relative to a factorisation. Measured: geometric mean
 over bulani1, bulani2, bulani4 and the policies ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
 
+LEAST_GAIN = 2e-3
+"""Seconds of an iteration that conjugate gradients must save. A whole solve saves less than it takes to compile where
+they save less, and a factorisation takes the fewest iterations, however priors and constants scale the system."""
+
 DENSE_MATRICES = 4
 """Matrices of that size in memory for a dense factorisation: the system, a copy of its blocks, its transpose, its
 factor."""
@@ -112,13 +116,15 @@ def choose_linear_solver(
 
 
 def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
-    """The linear solver with the lowest predicted time to convergence. Without pixels, as in a pose graph, it is a
-    factorisation if memory allows: conjugate gradients take some 75 products a step there, and twice to six times the
-    iterations (`python -m benchmarks.pose_graph --linear-solver implicit`). Arguments as for `work`."""
+    """The linear solver with the lowest predicted time to convergence, a factorisation where another one gains little
+    (`LEAST_GAIN`). Without pixels, as in a pose graph, it is a factorisation if memory allows: conjugate gradients take
+    some 75 products a step there, and twice to six times the iterations (`python -m benchmarks.pose_graph
+    --linear-solver implicit`). Arguments as for `work`."""
     predicted = predict(problem, observations)
     if problem.residuals and stands_for_rows(problem).all() and np.isfinite(predicted["explicit"]):
         return "explicit"
-    times = {name: time if name == "explicit" else INEXACT_ITERATIONS * time for name, time in predicted.items()}
+    inexact = lambda time: max(INEXACT_ITERATIONS * time, time + LEAST_GAIN)
+    times = {name: time if name == "explicit" else inexact(time) for name, time in predicted.items()}
     return min(times, key=lambda name: times[name])  # type: ignore[return-value]
 
 

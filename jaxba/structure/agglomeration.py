@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 MAX_DENSE_ENTRIES = 1 << 20
 """Cameras times points up to which common points are counted by a sparse-dense product, which takes half the time."""
@@ -61,3 +62,10 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
         weight = csr_matrix((weight.data[between], (row[between], column[between])), shape=(len(kept), len(kept)))
         size, label = np.bincount(new, size), new[label]
     return np.unique(label, return_inverse=True)[1]
+
+
+def joined(label: Int[np.ndarray, " nodes"], index: Int[np.ndarray, " nodes"]) -> Int[np.ndarray, " clusters"]:
+    """A name for each cluster, the same for those with nodes of one index, also by way of others: a change of all nodes
+    of a name is one of whole indices."""
+    has = csr_matrix((np.ones(len(label)), (label, index)))
+    return connected_components(has @ has.T, directed=False)[1]

@@ -18,6 +18,7 @@ from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sharing import Sharing
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
 from jaxba.structure.track_buckets import Slots
+from jaxba.structure.unknowns import Unknowns
 from jaxba.typing import AnyArray, register_pytree
 
 CLUSTER_CAMERAS = 8
@@ -49,31 +50,30 @@ class ClusterLayout:
     pairs: PairLayout
     """Pairs of coarse slots of one point, which form the blocks of the coarse system."""
 
-    lenses: Sharing
-    """Clusters of cameras with one and the same lens: their changes of it are one unknown."""
+    ties: tuple[Sharing, ...]
+    """Clusters that have unknowns in common, for each of `Unknowns.parts`: their changes of these are one."""
 
 
 def cluster_layout(
-    observations: ObservationOrder, slots: Slots, lenses: Sharing, agreement: Agreement
+    observations: ObservationOrder, slots: Slots, unknowns: Unknowns, agreement: Agreement
 ) -> ClusterLayout:
     """Clusters the cameras and lists the pairs of clusters with common points.
 
-    Clusters are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`. The other shards of a problem
-    (`agreement`) have the same clusters."""
-    from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
+    Clusters have whole frames. They are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`. The
+    other shards of a problem (`agreement`) have the same clusters."""
+    from jaxba.structure.agglomeration import agglomerate, joined, shared_points  # SciPy: its import takes 0.2 s
 
     camera, point, cameras = observations.camera, observations.point, observations.num_cameras
-    points = len(observations.tracks)
+    points, frames, lenses = len(observations.tracks), unknowns.poses.distinct, unknowns.lenses
+    frame = np.asarray(unknowns.poses.index)
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
-    shared = agreement.total("shared points", shared_points(camera, point, cameras, points)[0])
-    label = agglomerate(shared, cameras, num_clusters)
+    shared = agreement.total("shared points", shared_points(frame[camera], point, frames, points)[0])
+    label = agglomerate(shared, frames, num_clusters)[frame]
     of_lens = np.where(np.isin(lenses.index, lenses.owners), lenses.index, cameras)
     parts, split = np.unique(label * (cameras + 1) + of_lens, return_inverse=True)
-    names = -1 - np.arange(int(label.max()) + 1)  # clusters that have no lens in common
     if len(parts) <= 2 * MAX_CLUSTERS:
-        label, lens = split, parts % (cameras + 1)
-        names = np.where(lens < cameras, lens, -1 - np.arange(len(parts)))
-    clusters = len(names)
+        label = split
+    clusters = int(label.max()) + 1
     order = sorted_by(label[camera], clusters)
     order = order[sorted_by(point[order], points)]
     keys = point[order].astype(np.int64) * clusters + label[camera[order]]
@@ -92,7 +92,7 @@ def cluster_layout(
         levels=sum_tree(slots.slot[order], counts, slots.empty, width, agreement=agreement.within("slots")),
         point=slots.point[first_slots],
         pairs=pair_layout(*keyed, factor=True, banded=False, agreement=agreement.within("pairs")),
-        lenses=Sharing.of(names),
+        ties=tuple(Sharing.of(joined(label, np.asarray(sharing.index))) for sharing, _ in unknowns.parts),
     )
 
 

@@ -217,7 +217,7 @@ def build_layout(
     if options.cluster_cameras is not None and pair_lists is not None:
         drawn_partitions = partition_layout(observations, slots, pair_lists, options.cluster_cameras)
     if options.uses_camera_clusters:
-        camera_clusters = cluster_layout(observations, slots, unknowns.lenses, agreement.within("clusters"))
+        camera_clusters = cluster_layout(observations, slots, unknowns, agreement.within("clusters"))
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slots.point,

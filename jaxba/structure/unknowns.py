@@ -91,7 +91,7 @@ class Unknowns(ArrayRecord):
     @property
     def shared(self) -> bool:
         """Whether several cameras have a number in common: of a lens, or the pose of a frame."""
-        return any(sharing.several for sharing, _ in self._parts)
+        return any(sharing.several for sharing, _ in self.parts)
 
     @property
     def merged(self) -> bool:
@@ -99,7 +99,7 @@ class Unknowns(ArrayRecord):
         return self.poses.several or (self.shared and bool(self.own))
 
     @property
-    def _parts(self) -> tuple[tuple[Sharing, int], ...]:
+    def parts(self) -> tuple[tuple[Sharing, int], ...]:
         """What shares the columns of a camera's block, in order, and how many these are."""
         lens = (self.lenses, len(self.columns) - sum(self.own_sizes))
         return (self.poses, POSE_SIZE), lens, *zip(self.own, self.own_sizes, strict=True)
@@ -112,13 +112,13 @@ class Unknowns(ArrayRecord):
     @property
     def numbers(self) -> Sharing:
         """Which unknowns of all blocks, flattened, are the same."""
-        return Sharing.joined(*self._parts)
+        return Sharing.joined(*self.parts)
 
     def _each(self, name: str, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         if not self.shared:
             return x
         found, start = [], 0
-        for sharing, size in self._parts:
+        for sharing, size in self.parts:
             found.append(getattr(sharing, name)(x[:, start : start + size]))
             start += size
         return jnp.concatenate(found, axis=1)
@@ -138,7 +138,7 @@ class Unknowns(ArrayRecord):
     def constant(self, intrinsics: Intrinsics, *, alone: bool) -> tuple[bool, ...]:
         """Which columns of the blocks are constant for all cameras: with `fixed` intrinsics all of these; where cameras
         are optimised `alone`, one by one, what some of them share."""
-        together = [alone and sharing.several for sharing, size in self._parts for _ in range(size)]
+        together = [alone and sharing.several for sharing, size in self.parts for _ in range(size)]
         fixed = [*[False] * POSE_SIZE, *(intrinsics == "fixed" and column < self.lens_size for column in self.columns)]
         return tuple(one or other for one, other in zip(together, fixed, strict=True))
 

@@ -251,8 +251,8 @@ def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common()
     problem = with_lenses(scene, np.arange(64) % 2, np.ones((2, 3), bool))
     layout = build_layout(problem, StepOptions(linear_solver="implicit"))
     assert layout.clusters is not None
-    assert layout.clusters.lenses.several
-    of_cluster = np.asarray(layout.clusters.lenses.members)[np.asarray(layout.clusters.label)]
+    assert layout.clusters.ties[1].several
+    of_cluster = np.asarray(layout.clusters.ties[1].members)[np.asarray(layout.clusters.label)]
     np.testing.assert_array_equal(of_cluster, np.asarray(layout.unknowns.lenses.members))
     # the two changes that all cameras of a lens have in common cost few iterations
     rules = (ConjugateGradients(name) for name in ("two-level", "schur-jacobi"))

@@ -9,16 +9,19 @@ import pytest
 import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_problems import draw
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from support import random_views
 
 from jaxba import BundleProblem, ProblemError, build_layout
+from jaxba.problem.frames import in_frames
 from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver import choose
 from jaxba.solver.choose import choose_linear_solver, count_pairs, predict
 from jaxba.structure.observation_order import ObservationOrder
+from jaxba.structure.residual_slots import laid_out
 
 SEQUENCE = SceneConfig(
     cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
@@ -105,6 +108,13 @@ def test_a_system_of_hundreds_of_cameras_without_a_band_is_not_factored():
 def test_a_few_cameras_are_factored():
     for problem in (support.tiny(), support.single(), random_scene(replace(SEQUENCE, cameras=50), 0)):
         assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
+
+
+def test_a_few_cameras_in_rigs_with_priors_are_factored_though_a_product_is_quicker():
+    problem = laid_out(in_frames(draw(34)[0]))
+    assert problem.num_cameras == 18
+    assert min(predict(problem), key=predict(problem).__getitem__) != "explicit"
+    assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
 
 
 def test_many_cameras_that_see_few_points_are_factored_by_way_of_the_points():
