@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -427,7 +427,7 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
     with common.notes_printed():
         found = covariance(problem, loss=loss)
     names = ("poses", "lenses", "points", "points_given_cameras")
-    arrays = {name: getattr(found, name) for name in names} | {"axes": np.array(AXES)}
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in names} | {"axes": np.array(AXES)}
     if (labels := problem.labels) is not None:
         ids = {"image_names": np.array(labels.names), "image_ids": labels.images}
         arrays |= ids | {"camera_ids": labels.lenses, "point_ids": labels.points}
@@ -442,12 +442,13 @@ def _by_recipes(
     """Solves by several policies, and prints the end of each; the lowest one is the solution."""
     from jaxba.solver.recipes import RECIPES, solve_recipes
 
-    common.require(args.recipes in range(2, len(RECIPES) + 1), f"--recipes must be 2 to {len(RECIPES)}")
+    count = args.recipes or 0
+    common.require(2 <= count <= len(RECIPES), f"--recipes must be 2 to {len(RECIPES)}")
     others = {"--record": args.record, "--view": args.view, "--log": args.log, "--retriangulate": args.retriangulate}
     given = [name for name, value in {**others, "--devices and --processes": _is_divided(args)}.items() if value]
     common.require(not given, f"{', '.join(given)}: for one policy, not for --recipes")
     with common.notes_printed():
-        found = solve_recipes(problem, args.recipes, policy, options)
+        found = solve_recipes(problem, count, policy, options)
     for name, one in zip((args.policy, *RECIPES[1:]), found, strict=False):
         common.print_line(f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}")
     return min(found, key=lambda one: one.final_cost), []

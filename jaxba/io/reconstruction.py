@@ -39,9 +39,8 @@ def from_pycolmap(reconstruction: Any, config: Any = None, options: Any = None) 
         reconstruction.write_binary(folder)
         problem = read_colmap(folder, refine_principal_point=principal)
     assert problem.labels is not None
-    labels, of_part = problem.labels, {}
+    labels, of_part, known = problem.labels, {}, set(problem.labels.images.tolist())
     if config is not None:
-        known = set(labels.images.tolist())
         points = {*config.variable_points, *config.constant_points} & set(labels.points.tolist())
         of_part["images"] = labels.positions("image", sorted(known & set(config.images)))
         of_part["points"] = labels.positions("point", sorted(points))

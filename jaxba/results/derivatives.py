@@ -45,7 +45,7 @@ from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.rotations import compose_left, rotation_matrix
 from jaxba.runtime.jit import jit
-from jaxba.runtime.numerics import check_x64, numerics
+from jaxba.runtime.numerics import check_x64, is_traced, numerics
 from jaxba.solver.loop import solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import check_problem
@@ -129,7 +129,7 @@ def differentiable_solve(
 
     def forward(inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, Any]]:
         check_x64(np.float64)
-        if _traced(inputs):
+        if is_traced(inputs):
             return prepared().solved(inputs)
         with numerics(np.float64):
             solved = solve(_with_inputs(problem, inputs), policy, options).problem
@@ -138,7 +138,7 @@ def differentiable_solve(
     def backward(saved: tuple[SolveInputs, Any], cotangents: tuple[Array, Array]) -> tuple[SolveInputs]:
         inputs, end = saved
         if not isinstance(end, BundleProblem):
-            return (prepared().transposed(inputs, *end, cotangents),)
+            return (prepared().transposed(inputs, end[0], end[1], cotangents),)
         with numerics(np.float64):
             at = _Prepared.of(end, policy, options, facing_away(_with_inputs(end, inputs)))
             here, symmetries = at.setup.placed.here, _symmetries(at.setup.placed.counted, at.setup.layout)
@@ -159,10 +159,6 @@ def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
         whitening=problem.whitening if inputs.whitening is None else host(inputs.whitening),
         residuals=replace(problem.residuals, rows=rows),
     )
-
-
-def _traced(tree: Any) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 class _Prepared(NamedTuple):
@@ -196,7 +192,7 @@ class _Prepared(NamedTuple):
         points = jnp.asarray(inputs.points).at[layout.points].set(end.points.T, mode="drop")
         return (model.as_given(end.cameras).T, points), (inputs, (end.cameras.T, points))
 
-    def symmetries(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+    def symmetries(self, cameras: AnyArray, points: AnyArray) -> tuple[Array, Array]:
         """`_symmetries` inside a transformation of JAX."""
         setup = self.setup
         if setup.problem.residuals and not self.fixed:
@@ -204,7 +200,8 @@ class _Prepared(NamedTuple):
 
         def host(cameras: Array, points: Array) -> tuple[np.ndarray, np.ndarray]:
             order = np.minimum(np.asarray(setup.layout.points), len(points) - 1)
-            state = LMState(np.asarray(cameras).T, np.asarray(points).T[:, order], np.zeros(()))
+            parts: Any = np.asarray(cameras).T, np.asarray(points).T[:, order], np.zeros(())
+            state = LMState(*parts)
             solved = setup.placed.after(setup.layout, setup.layout.points, state, setup.options)
             return _symmetries(solved, setup.layout, fixed=self.fixed)
 
@@ -232,7 +229,7 @@ class _Prepared(NamedTuple):
         symmetries = self.symmetries(cameras, points) if symmetries is None else symmetries
         arguments = (layout, slots, cameras, points, *symmetries, inputs, cotangents)
         found, residual = jit(_solve_transposed, once=True, static_argnames="options")(*arguments, options=step)
-        if _traced(residual):
+        if is_traced(residual):
             return jax.tree.map(lambda x: jnp.where(residual < LARGEST_RESIDUAL, x, jnp.nan), found)
         if not float(residual) < LARGEST_RESIDUAL:
             raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")

@@ -66,9 +66,14 @@ def for_traces(function: Function) -> Function:
     return cast(Function, with_defaults)
 
 
+def is_traced(values: Any) -> bool:
+    """Whether JAX traces: one of the values, arrays in a pytree, is a tracer."""
+    return any(isinstance(value, Tracer) for value in jax.tree.leaves(values))
+
+
 def refuse_traces(values: Any) -> None:
-    """Raises a TypeError if JAX traces: one of the values, arrays in a pytree, is a tracer."""
-    if any(isinstance(value, Tracer) for value in jax.tree.leaves(values)):
+    """Raises a TypeError if JAX traces these values."""
+    if is_traced(values):
         raise TypeError(TRACED)
 
 
