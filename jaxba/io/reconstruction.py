@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from jaxba.io.colmap import read_colmap, write_colmap
-from jaxba.problem.bundle_problem import BundleProblem, ProblemWarning
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.checks import shown
 from jaxba.problem.gauge import Gauge, with_gauge
 from jaxba.problem.hold import hold
 from jaxba.problem.part import part
@@ -34,13 +35,21 @@ def from_pycolmap(reconstruction: Any, config: Any = None, options: Any = None) 
             `min_track_length` count here, and the rest for `jaxba.bundle_adjustment`. None: COLMAP's defaults.
 
     Raises ProblemError: as `read_colmap` and `part`; ValueError: `config` names what is not in the problem."""
+    if not hasattr(reconstruction, "write_binary"):
+        raise ValueError(f"reconstruction must be a pycolmap.Reconstruction, not {shown(reconstruction)}")
     principal = options is not None and options.refine_principal_point
     with tempfile.TemporaryDirectory() as folder:
         reconstruction.write_binary(folder)
-        problem = read_colmap(folder, refine_principal_point=principal)
+        try:
+            problem = read_colmap(folder, refine_principal_point=principal)
+        except ProblemError as error:
+            raise ProblemError(str(error).replace(folder, "the reconstruction")) from None
     assert problem.labels is not None
     labels, of_part, known = problem.labels, {}, set(problem.labels.images.tolist())
     if config is not None:
+        for what, items in (("image", config.images), ("point3D", {*config.variable_points, *config.constant_points})):
+            if lost := [one for one in items if not getattr(reconstruction, f"exists_{what}")(one)]:
+                raise ValueError(f"config names {what} {min(lost)}, which the reconstruction does not have")
         points = {*config.variable_points, *config.constant_points} & set(labels.points.tolist())
         of_part["images"] = labels.positions("image", sorted(known & set(config.images)))
         of_part["points"] = labels.positions("point", sorted(points))
@@ -94,7 +103,10 @@ def update(reconstruction: Any, problem: BundleProblem) -> None:
         old, new = Path(folder, "old"), Path(folder, "new")
         old.mkdir()
         reconstruction.write_binary(old)
-        write_colmap(problem, new, like=old)
+        try:
+            write_colmap(problem, new, like=old)
+        except ProblemError:
+            raise ProblemError("the problem is not one of this reconstruction") from None
         found = pycolmap.Reconstruction(new)
     for identity, camera in found.cameras.items():
         reconstruction.camera(identity).params = camera.params

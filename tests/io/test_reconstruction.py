@@ -114,3 +114,17 @@ def test_a_part_can_be_written_into_the_whole_model(tmp_path):
     before = pycolmap.Reconstruction(tmp_path / "old")
     for image in sorted(before.images)[4:]:
         assert (written.images[image].cam_from_world().matrix() == before.images[image].cam_from_world().matrix()).all()
+
+
+def test_what_cannot_be_is_one_line_without_a_temporary_name():
+    model, config = scene(3), pycolmap.BundleAdjustmentConfig()
+    with pytest.raises(ValueError, match=r"must be a pycolmap\.Reconstruction, not 'sparse/0'"):
+        jaxba.from_pycolmap("sparse/0")
+    with pytest.raises(jaxba.ProblemError, match=r"^the reconstruction: no image sees a point$"):
+        jaxba.from_pycolmap(pycolmap.Reconstruction())
+    config.add_image(77)
+    with pytest.raises(ValueError, match="config names image 77, which the reconstruction does not have"):
+        jaxba.from_pycolmap(model, config)
+    solution = jaxba.solve(jaxba.from_pycolmap(model), options=jaxba.SolveOptions(max_iterations=1))
+    with pytest.raises(jaxba.ProblemError, match="the problem is not one of this reconstruction"):
+        solution.update(scene(4))
