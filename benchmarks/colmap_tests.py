@@ -130,7 +130,8 @@ def solved(one: Situation, *, tight: bool) -> tuple[int, float, int, int, float,
     for name, value in one.options.items():
         setattr(options, name, value)
     model = copy.deepcopy(one.scene)  # the adjuster does not keep it alive
-    summary = pycolmap.create_default_ceres_bundle_adjuster(options, one.config, model).solve().ceres_summary
+    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, one.config, model)
+    summary = adjuster.solve().ceres_summary
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", jaxba.ProblemWarning)
         ours = jaxba.bundle_adjustment(copy.deepcopy(one.scene), options, one.config)

@@ -5,7 +5,8 @@
 `JAXBA_DATA` names the folder of real problems, and `JAXBA_CERES` the program with C++ Ceres (benchmarks/README.md).
 Windows are neighbouring cameras, 5 to 20 of them, with 50 to 500 of the points that they share, of BAL's and KITTI's
 problems; half of them disturbed by 0.3 degrees. Ceres is timed on `--peers` of them by its own clock (without start and
-reading), one thread a problem, and counted as two processes; DENSE_SCHUR, up to 100 iterations and `ftol` as ours.
+reading), one thread a problem, and counted as two processes; DENSE_SCHUR, up to 100 iterations and `ftol` as ours. So
+is pycolmap, without reading.
 """
 
 from __future__ import annotations
@@ -84,6 +85,29 @@ def ceres_seconds(problems: list[BundleProblem]) -> tuple[list[float], list[floa
     return seconds, costs
 
 
+def pycolmap_seconds(problems: list[BundleProblem]) -> list[float]:
+    """pycolmap's seconds of the adjustment alone, without reading; none if it is not installed."""
+    try:
+        import pycolmap
+    except ImportError:
+        return []
+    options, seconds = pycolmap.BundleAdjustmentOptions(), []
+    options.print_summary = False
+    ceres = options.ceres.solver_options
+    ceres.function_tolerance, ceres.num_threads, ceres.max_num_iterations = 1e-6, 1, 100
+    with tempfile.TemporaryDirectory() as folder:
+        for number, problem in enumerate(problems):
+            path = Path(folder) / str(number)
+            jaxba.write_colmap(problem, path)
+            model, config = pycolmap.Reconstruction(path), pycolmap.BundleAdjustmentConfig()
+            for image in model.images:
+                config.add_image(image)
+            began = time.perf_counter()
+            pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+            seconds.append(time.perf_counter() - began)
+    return seconds
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -98,6 +122,8 @@ def main() -> None:
     seconds, costs = ceres_seconds(few)
     if seconds:
         print(f"C++ Ceres, two processes: {2 / np.mean(seconds):.1f} a second")
+    if by_colmap := pycolmap_seconds(few):
+        print(f"pycolmap, two processes: {2 / np.mean(by_colmap):.1f} a second")
 
     began, times, found = time.perf_counter(), [], []
     for result in jaxba.solve_many(problems, args.policy):
