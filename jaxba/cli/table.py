@@ -98,12 +98,12 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     distance = solution.distance
     left = f"; estimated within {distance:.1e} of the end" if math.isfinite(distance) else ""
     lines = [
-        f"{solution.num_residuals} residuals, {solution.num_parameters} parameters",
         f"{state}: {solution.termination.reason}{left}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
         *by_kind,
         f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
-        f"linear solver {solution.linear_solver}",
+        f"linear solver {solution.linear_solver}; {solution.num_residuals} residuals, "
+        f"{solution.num_parameters} parameters",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]

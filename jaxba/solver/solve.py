@@ -137,7 +137,6 @@ class Solution(ArrayRecord):
     def _told(self) -> dict[str, str]:
         return {
             "converged" if self.converged else "not converged": self.termination.reason,
-            "size": f"{self.num_residuals} residuals, {self.num_parameters} parameters",
             "cost": f"{self.initial_cost:.6g} -> {self.final_cost:.6g}",
             "iterations": f"{self.iterations} in {self.total_s:.3g} s, compilation {self.compile_s:.3g} s",
         }
@@ -148,7 +147,8 @@ class Solution(ArrayRecord):
     def _repr_html_(self) -> str:
         from jaxba.problem.display import card
 
-        return card({"problem": repr(self.problem).partition("(")[2][:-1], **self._told()}, self.plot())
+        size = {"size": f"{self.num_residuals} residuals, {self.num_parameters} parameters"}
+        return card({"problem": repr(self.problem).partition("(")[2][:-1], **size, **self._told()}, self.plot())
 
 
 def solve(

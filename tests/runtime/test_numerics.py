@@ -97,12 +97,6 @@ def test_a_problem_of_numpy_inside_of_jit_is_refused_as_well():
         jax.jit(lambda x: x + jaxba.solve(GAUGED).final_cost)(1.0)
 
 
-def test_inputs_that_jax_traces_are_refused_by_a_differentiable_solve():
-    find, inputs = jaxba.differentiable_solve(GAUGED), jaxba.inputs_of(GAUGED)
-    with pytest.raises(TypeError, match="JAX traces this call"):
-        jax.jit(find)(inputs)
-
-
 def test_float64_without_64_bits_is_refused_by_all_that_would_compute_in_float32():
     prepared = jaxba.prepare(GAUGED, "ceres", OPTIONS)
     layout, state, options = prepared.layout, prepared.state, prepared.options
