@@ -147,6 +147,20 @@ def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_pat
         assert "looks along -z" in str(arrays["axes"])
 
 
+def test_a_file_of_constants_names_a_part_of_the_images(model, tmp_path):
+    problem = read_problem(model)
+    (tmp_path / "c.yaml").write_text("part: {images: [image0001.jpg, 3], points: all, ignored: [2], min_track: 2}\n")
+    found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    assert np.flatnonzero(~found.constants.poses.any(axis=1)).tolist() == [0, 2]
+    assert 1 not in found.point_index
+    (tmp_path / "c.yaml").write_text("part: {image: [1]}\n")
+    with pytest.raises(UsageError, match="part: unknown key image; there are images, points, ignored, min_track"):
+        constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    (tmp_path / "c.yaml").write_text("part: {min_track: many}\n")
+    with pytest.raises(UsageError, match="min_track: must be a whole number, not many"):
+        constrained(problem, (), None, str(tmp_path / "c.yaml"))
+
+
 NAMES = ("000010", "1_000", "0x10", "1e3", "yes", "2024-01-01")
 
 
