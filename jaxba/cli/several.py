@@ -29,15 +29,7 @@ COSTS = "costs.csv"
 """Name of the file of costs in the folder of solutions."""
 
 FOR_ONE = (
-    "log",
-    "survey",
-    "covariance",
-    "record",
-    "view",
-    "retriangulate",
-    "processes",
-    "distributed",
-    "devices",
+    *("log", "survey", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices"),
     "recipes",
 )
 """Options of a single problem."""
