@@ -68,7 +68,7 @@ def parse_vectors(
         raise ValueError(f"{name}: must be a mapping from {kind}s to [x, y, z], not {_written(given)}")
     items = parse_items(list(given), f"names or ids of {kind}s")
     vectors = [parse_numbers(f"{name}: {item}", place, "three numbers", (3,)) for item, place in given.items()]
-    return [[item] for item in items], {name: vectors, "stddev": _stddev(value.get("stddev", "1"), items, kind)}
+    return [[item] for item in items], {name: vectors, "stddev": parse_stddev(value, items, kind)}
 
 
 def parse_pairs(
@@ -107,8 +107,9 @@ def _written(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
-def _stddev(value: Any, images: list[str], kind: str) -> Float[np.ndarray, "n 3"]:
-    """Standard deviations of each image or point."""
+def parse_stddev(value: dict[str, Any], images: list[str], kind: str) -> Float[np.ndarray, "n 3"]:
+    """Standard deviations of each image or point; 1 if nothing is said. Raises ValueError: others; one line."""
+    value = value.get("stddev", "1")
     if isinstance(value, list) and (len(value) != 3 or any(isinstance(one, list) for one in value)):
         if len(value) != len(images):
             what = f"must be one number, three, or one or three for each of {len(images)} {kind}s"

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args
 
 from jaxba.cli.common import UsageError
 from jaxba.cli.constraint_values import meant, parse_items, parse_mapping, parse_numbers
 from jaxba.cli.measurements import MEASURED, with_measured
+from jaxba.cli.survey import POSITIONS, with_control_points, with_positions
+from jaxba.io.geodesy import Frame, projected
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
 from jaxba.problem.gauge import Gauge, with_gauge
 from jaxba.problem.hold import hold
+from jaxba.problem.marks import Marks
 from jaxba.problem.part import part
 from jaxba.settings.configurations import SettingsError, read_file
 
@@ -25,6 +30,8 @@ KEYS = {
     "constant_cameras": "ids of cameras, which images share",
     "constant_extrinsics": "ids of cameras, whose places in their rigs do not move",
     "constant_numbers": "focal, principal_point, distortion or names such as k2",
+    "crs": "projected coordinate system that the scene gets",
+    "position_priors": POSITIONS,
     **MEASURED,
     "part": "images, points, ignored and min_track of jaxba.part",
     "gauge": "free, two-cameras or three-points",
@@ -38,13 +45,36 @@ OF_PART = {"images": "image", "points": "point", "ignored": "point", "min_track"
 def constrained(
     problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None, *, strict: bool = False
 ) -> BundleProblem:
-    """The problem with what the options and the file say. `constant` is what `--constant` names, `gauge` what `--gauge`
-    does, and `file` a YAML file of constants and priors. `strict` refuses positions of images that are not in the
-    problem, instead of leaving them out with a note. Raises UsageError: something is not in the problem; one line that
-    names the option or the key. Raises ProblemError: as the functions of `jaxba` that do it."""
+    """`surveyed` of a problem without a file."""
+    return surveyed(problem, constant, gauge, file, strict=strict)[0]
+
+
+def surveyed(
+    problem: BundleProblem,
+    constant: tuple[str, ...],
+    gauge: Gauge | None,
+    file: str | None,
+    *,
+    strict: bool = False,
+    path: str | None = None,
+) -> tuple[BundleProblem, Marks | None]:
+    """The problem with what the options and the file say, and the marks that it has got by that. `constant` is what
+    `--constant` names, `gauge` what `--gauge` does, `file` a YAML file of constants and priors, and `path` that of the
+    problem. `strict` refuses positions of images that are not in the problem, instead of leaving them out with a note.
+    Raises UsageError: something is not in the problem; one line that names the option or the key. Raises ProblemError:
+    as the functions of `jaxba` that do it."""
     settings = {} if file is None else _read(file)
-    if (first := "position_priors") in settings:  # the scene is aligned before anything is constant
-        problem = _applied(problem, file, first, settings.pop(first), strict)
+    frame: Frame | None = None
+    with _named(file, "crs"):
+        if "crs" in settings:
+            frame = projected(settings.pop("crs"))
+    with _named(file, key := "position_priors"):
+        if key in settings:  # the scene is aligned before anything is constant
+            problem, frame = with_positions(problem, f"{file}: {key}", settings.pop(key), strict, frame)
+    with _named(file, key := "control_points"):
+        marks, value = None, settings.get(key)
+        if isinstance(value, dict) and "file" in value:
+            problem, marks = with_control_points(problem, f"{file}: {key}", settings.pop(key), strict, frame, path)
     try:
         problem = hold(problem, numbers=[one.replace("-", "_") for one in constant if one not in PARTS])
     except ValueError as error:
@@ -61,13 +91,16 @@ def constrained(
             f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {shown(in_file)}"
         )
     for key, value in sorted(settings.items(), key=lambda item: item[0] != "part"):  # it says what is seen
-        problem = _applied(problem, file, key, value, strict)
-    return with_gauge(problem, gauge or in_file)
+        with _named(file, key):
+            problem = _apply(problem, f"{file}: {key}", key, value, strict)
+    return with_gauge(problem, gauge or in_file), marks
 
 
-def _applied(problem: BundleProblem, file: str | None, key: str, value: Any, strict: bool) -> BundleProblem:
+@contextmanager
+def _named(file: str | None, key: str) -> Iterator[None]:
+    """Errors of a key of the file begin with its name."""
     try:
-        return _apply(problem, f"{file}: {key}", key, value, strict)
+        yield
     except ValueError as error:
         raise UsageError(f"--constraints {file}: {key}: {error}") from None
 

@@ -18,11 +18,9 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.hold import every_lens
 from jaxba.problem.labels import Part
-from jaxba.problem.measured import with_position_priors
 
 MEASURED = {
-    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss, loss_scale and align",
-    "control_points": "positions: {id: [x, y, z]}, stddev, loss and loss_scale",
+    "control_points": "positions: {id: [x, y, z]}, or file, check, pixels, crs and align; stddev, loss and loss_scale",
     "distances": "a list of {points: [id, id], length, stddev}",
     "gravity": "up, directions: {name or id: [x, y, z]}, stddev, loss and loss_scale",
     "relative_poses": "a list of {images: [name or id, name or id], rotation, translation, stddev}",
@@ -47,17 +45,13 @@ def with_measured(problem: BundleProblem, where: str, key: str, value: Any, stri
         items, columns = values.parse_pairs(value, kind, shapes)
     else:
         what = "directions" if key == "gravity" else "positions"
-        more = {"gravity": (["up"], []), "position_priors": ([], ["align"])}.get(key, ())
-        items, columns = values.parse_vectors(value, what, kind, *more)
+        items, columns = values.parse_vectors(value, what, kind, ["up"] if key == "gravity" else [])
         loss = values.parse_loss(value)
-    at, kept = _parts(problem, where, kind, items, what, strict)
+    at, kept = parts_of(problem, where, kind, items, what, strict)
     if (at[:1] == at[1:]).any():
         raise ValueError(f"a pair has the same {kind} twice")
     columns = {name: [column[k] for k in kept] for name, column in columns.items()}
     stddev, of = np.stack(columns["stddev"]), columns.get(what)
-    if key == "position_priors":
-        align = values.parse_truth("align", value.get("align", "true"))
-        return with_position_priors(problem, of, stddev=stddev, images=at[0].tolist(), loss=loss, align=align)
     if key == "control_points":
         rows = residuals.control_point(point=at[0], position=of, whitening=np.eye(3) / stddev[:, None])
     elif key == "gravity":
@@ -76,10 +70,11 @@ def with_measured(problem: BundleProblem, where: str, key: str, value: Any, stri
     return with_residual(problem, rows, loss=loss)
 
 
-def _parts(
+def parts_of(
     problem: BundleProblem, where: str, kind: Part, items: list[list[str]], what: str, strict: bool
 ) -> tuple[Int[np.ndarray, "n kept"], Int[np.ndarray, " kept"]]:
-    """Images or points of those items that name no others, and which items these are."""
+    """Images or points of those items that name no others, and which items these are. Others are left out with a note.
+    Raises ValueError: none is left, or one is left out and `strict`; one line."""
     labels, image = problem.labels, kind == "image"
     names = frozenset(labels.names if labels is not None and image else ())
     count = problem.num_cameras if image else problem.num_points
@@ -89,13 +84,14 @@ def _parts(
     kept, others = np.flatnonzero(known.all(axis=1)), list(dict.fromkeys(np.array(items)[~known]))
     if not len(kept):
         raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others)}")
-    _leave_out(where, f"{what} of {counted(len(others), kind)} that the problem does not have", others, strict)
+    leave_out(where, f"{what} of {counted(len(others), kind)} that the problem does not have", others, strict)
     flat = wanted[kept].T.ravel()
     at = flat.astype(int) if labels is None else labels.positions(kind, flat)
     return at.reshape(-1, len(kept)), kept
 
 
-def _leave_out(where: str, what: str, names: list[str], strict: bool) -> None:
+def leave_out(where: str, what: str, names: list[str], strict: bool) -> None:
+    """Notes what is left out, if it is anything. Raises ValueError: `strict`; one line."""
     if names and strict:
         raise ValueError(f"{what}: {values.names_of(names)}")
     report([f"{where}: left out {what}: {values.names_of(names)}"] if names else [])
@@ -118,7 +114,7 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
         next((x for x in (folder / f"{n}.npy", (folder / n).with_suffix(".npy")) if x.is_file()), None) for n in names
     ]
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
-    _leave_out(where, f"{counted(len(missing), 'image')} without a map", missing, strict)
+    leave_out(where, f"{counted(len(missing), 'image')} without a map", missing, strict)
     camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)
     for at, file in enumerate(files):
         if file is not None:

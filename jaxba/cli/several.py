@@ -28,7 +28,10 @@ from jaxba.solver.solve import Solution
 COSTS = "costs.csv"
 """Name of the file of costs in the folder of solutions."""
 
-FOR_ONE = ("log", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices", "recipes")
+FOR_ONE = (
+    *("log", "survey", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices"),
+    "recipes",
+)
 """Options of a single problem."""
 
 PROGRESS_S = 0.2, 10.0

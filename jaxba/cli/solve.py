@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from jaxba.cli import common, processes, table, view
+from jaxba.cli import common, processes, survey_report, table, view
 from jaxba.cli.colmap_options import translated
-from jaxba.cli.constraints import constrained
+from jaxba.cli.constraints import surveyed
 from jaxba.cli.options import options, parse
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.cli.overwriting import policy_file
@@ -32,6 +32,7 @@ from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.gauge import Gauge
 from jaxba.problem.hold import hold
 from jaxba.problem.losses import Loss
+from jaxba.problem.marks import Marks
 from jaxba.problem.options import ConjugateGradients, Intrinsics, LinearSolverChoice, Preconditioner, Rotation, Scaling
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
@@ -193,6 +194,9 @@ class Output:
     resume: bool = False
     """Go on with several problems where it ended."""
 
+    survey: Annotated[str | None, "FILE"] = None
+    """CSV of control points, check points and distances."""
+
     covariance: Annotated[str | None, "FILE"] = None
     """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge or priors."""
 
@@ -321,7 +325,7 @@ def _run(args: Arguments) -> int:
         return _run_main(args)
     try:  # the others read, print and write nothing
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-            return _solve(replace(args, output=None, log=None, covariance=None))
+            return _solve(replace(args, output=None, log=None, covariance=None, survey=None))
     except (MainFailedError, InputError):  # which the first one reports
         return common.BAD_INPUT
 
@@ -340,11 +344,11 @@ def _solve(args: Arguments) -> int:
         from jaxba.cli import several
 
         if paths := several.inputs(problems):
-            return several.solve_all(args, paths, functools.partial(_constrained, args), policy, options)
+            return several.solve_all(args, paths, functools.partial(_one_of_several, args), policy, options)
     common.require(not args.resume, "--resume is for several problems")
     from jaxba.runtime.distributed import together
 
-    path, problem = together(lambda: _checked(args))
+    path, problem, marks = together(lambda: _checked(args))
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
@@ -355,11 +359,17 @@ def _solve(args: Arguments) -> int:
     common.print_line(table.summary(problem, solution, options.loss))
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
+    rows = survey_report.rows_of(solution.problem, marks)
+    if rows:
+        common.print_line(survey_report.text(rows))
+    if args.survey:
+        survey_report.write(args.survey, rows)
     if args.output:
-        write_solution(args.output, solution.problem, path)
+        solved = solution.problem if marks is None else marks.without(solution.problem)
+        write_solution(args.output, solved, path)
     if args.covariance:
         solved = hold(solution.problem, lenses="all") if args.intrinsics == "fixed" else solution.problem
-        _write_covariance(args.covariance, solved, options.loss)
+        _write_covariance(args.covariance, solved, options.loss, 0 if marks is None else len(marks.names))
     if args.log:
         from jaxba.io import json_lines
         from jaxba.solver.record import record_of
@@ -377,31 +387,39 @@ def _is_divided(args: Arguments) -> bool:
     return args.devices is not None or args.processes is not None or args.distributed
 
 
-def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
-    """The path of the problem and the problem, after all checks of files; the first process does this for all."""
+def _checked(args: Arguments) -> tuple[str | None, BundleProblem, Marks | None]:
+    """The path of the problem, the problem and its marks, after all checks of files; the first process does this for
+    all."""
     path = _path(args.problem)
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")
     outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
+    outputs["--survey"] = args.survey
     read = {f"the file of --{name}": getattr(args, name) for name in ("constraints", "settings")}
     read["the file of --policy"] = policy_file(args.policy)
     check_outputs(args.output, outputs, path, read)
     if args.view:
         common.check_extra(view.VIEWER)
     with common.notes_printed():
-        problem = _constrained(args, path)
+        problem, marks = _constrained(args, path)
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and not problem.residuals:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
-    return path, problem
+    return path, problem, marks
 
 
-def _constrained(args: Arguments, path: str | None) -> BundleProblem:
-    """A problem with what is constant or measured; without a path the built-in scene."""
+def _constrained(args: Arguments, path: str | None) -> tuple[BundleProblem, Marks | None]:
+    """A problem with what is constant or measured, and its marks; without a path the built-in scene."""
     problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
-    return constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
+    return surveyed(problem, args.constant, args.gauge, args.constraints, strict=args.strict, path=path)
+
+
+def _one_of_several(args: Arguments, path: str) -> BundleProblem:
+    problem, marks = _constrained(args, path)
+    common.require(marks is None, "a file of control points is for one problem")
+    return problem
 
 
 def _path(problem: str | None) -> str | None:
@@ -421,7 +439,8 @@ def _read(args: Arguments, path: str) -> BundleProblem:
     return read_problem(path, strict=args.strict)
 
 
-def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
+def _write_covariance(path: str, problem: BundleProblem, loss: Loss, marks: int) -> None:
+    """Writes covariances, but for the last points, which are so many marks."""
     from jaxba.results.covariance import covariance
 
     with common.notes_printed():
@@ -431,6 +450,8 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
     if (labels := problem.labels) is not None:
         ids = {"image_names": np.array(labels.names), "image_ids": labels.images}
         arrays |= ids | {"camera_ids": labels.lenses, "point_ids": labels.points}
+    own = slice(problem.num_points - marks)
+    arrays |= {name: value[own] for name, value in arrays.items() if name.startswith("point")}
     with open_output(path) as file:
         np.savez_compressed(file, **arrays)
     common.print_line(f"wrote {path}")

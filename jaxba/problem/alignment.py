@@ -49,25 +49,12 @@ def aligned(
 ) -> BundleProblem:
     """The problem moved, turned and scaled so that the centres of images are near the given positions.
 
-    What the positions do not determine beyond their noise stays as it was, with a `ProblemWarning`: the rotation about
-    a line, or all but the translation. Another one says that the positions do not fit.
-
-    Source: `umeyama` in rounds that each keep the nearer half of the images (least trimmed squares; Rousseeuw 1984).
-    Raises ProblemError: the positions are latitude and longitude, or mirrored; or too far apart."""
+    Another `ProblemWarning` than those of `alignment` says that the positions do not fit. Raises ProblemError: as that
+    does."""
     if not len(images):
         return problem
     centers = geometry.camera_centers(problem.cameras)[images]
-    with np.errstate(over="ignore"):
-        if not np.isfinite([np.sum(centers**2), np.sum(positions**2)]).all():
-            raise ProblemError("the scene cannot be aligned: positions are too far apart to be squared")
-    best, rank = _robust_fit(centers, positions, covariances)
-    left_over = 3 * len(images) - (3, 6, 7)[rank]
-    chi = float(np.quantile(_distances(best, centers, positions, covariances), MOST)) / UPPER_QUARTER
-    chi = chi * np.sqrt(3 * len(images) / left_over) if left_over else 0.0
-    if chi > DOUBTFUL or _rank(positions[:, :2], covariances[:, :2, :2]) == 0:
-        _refuse_other_axes(centers, positions)
-    if rank < 2:
-        _note(NOT_DETERMINED[rank])
+    best, chi = alignment(centers, positions, covariances)
     if chi > MISFIT:
         away = np.quantile(np.linalg.norm(best.points(centers) - positions, axis=1), MOST)
         _note(
@@ -77,8 +64,32 @@ def aligned(
     return transformed(problem, best)
 
 
-def _note(text: str) -> None:
-    warnings.warn(text, ProblemWarning, stacklevel=4)
+def alignment(
+    centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+) -> tuple[Similarity, float]:
+    """The similarity from places of a scene to measured positions, and the misfit over that of noise.
+
+    What the positions do not determine beyond their noise stays as it was, with a `ProblemWarning`: the rotation about
+    a line, or all but the translation.
+
+    Source: `umeyama` in rounds that each keep the nearer half of the places (least trimmed squares; Rousseeuw 1984).
+    Raises ProblemError: the positions are latitude and longitude, or mirrored; or too far apart."""
+    with np.errstate(over="ignore"):
+        if not np.isfinite([np.sum(centers**2), np.sum(positions**2)]).all():
+            raise ProblemError("the scene cannot be aligned: positions are too far apart to be squared")
+    best, rank = _robust_fit(centers, positions, covariances)
+    left_over = 3 * len(centers) - (3, 6, 7)[rank]
+    chi = float(np.quantile(_distances(best, centers, positions, covariances), MOST)) / UPPER_QUARTER
+    chi = chi * np.sqrt(3 * len(centers) / left_over) if left_over else 0.0
+    if chi > DOUBTFUL or _rank(positions[:, :2], covariances[:, :2, :2]) == 0:
+        _refuse_other_axes(centers, positions)
+    if rank < 2:
+        _note(NOT_DETERMINED[rank], 5)
+    return best, chi
+
+
+def _note(text: str, stacklevel: int = 4) -> None:
+    warnings.warn(text, ProblemWarning, stacklevel=stacklevel)
 
 
 def _robust_fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) -> tuple[Similarity, int]:
@@ -153,7 +164,7 @@ def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
         if near and np.abs(positions[:, latitude]).max() <= 90 and np.abs(positions[:, longitude]).max() <= 180:
             east, north = (np.radians(positions - middle)[:, at] * EARTH for at in (longitude, latitude))
             metres = np.stack([east * np.cos(np.radians(middle[latitude])), north, positions[:, 2]], axis=1)
-            others.append((metres, "latitude and longitude in degrees: give metres, such as UTM's or east, north, up"))
+            others.append((metres, "latitude and longitude in degrees: give metres, or crs: EPSG:4326"))
     misfit = _misfit(centers, positions)
     for other, what in others:
         if _misfit(centers, other) < min(BETTER * misfit, EXPLAINED):

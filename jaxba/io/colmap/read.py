@@ -5,6 +5,7 @@ Where the lenses of a problem are BAL's, its pixels are relative to the principa
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -74,6 +75,12 @@ def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
     found = [one.principal_point if one.focals else (np.nan, np.nan) for one in cameras]
     principal = np.where(np.isnan(found), sizes / 2, found)  # a panorama has its own in the middle
     return assembled.problem, Looks(model.points["rgb"][assembled.points], sizes, principal)
+
+
+def principal_points(folder: StrPath, images: Iterable[int]) -> Float[np.ndarray, "n 2"]:
+    """Principal points of images by id, pixels from the upper left corner. Raises ProblemError: as `read_colmap`."""
+    model = read_model(folder)
+    return np.array([model.cameras[model.images[image].camera].principal_point for image in images])
 
 
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:

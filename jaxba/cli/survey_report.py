@@ -1,0 +1,92 @@
+"""What a solve made of a survey: control and check points, and distances, as text and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxba import residuals
+from jaxba.cli.common import print_line
+from jaxba.io.files import open_output
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.labels import part_name
+from jaxba.problem.marks import Marks, found_at
+
+NAME_WIDTH = 20
+"""Characters of a name in the text."""
+
+
+class Row(NamedTuple):
+    """A line of the report: scene units, and pixels."""
+
+    kind: str  # control, check or distance
+    name: str
+    measured: tuple[float, ...]  # x, y and z, or the length
+    difference: tuple[float, ...]  # found less measured
+    sigmas: float  # RMS of the difference in standard deviations
+    images: int | str = ""
+    pixels: float | str = ""  # RMS
+
+
+def rows_of(problem: BundleProblem, marks: Marks | None) -> list[Row]:
+    """The report of a solved problem and its marks, with the points and distances of the residuals that it has."""
+    first = problem.num_points - (0 if marks is None else len(marks.names))
+    name = lambda one: part_name(problem.labels, "point", one).removeprefix("point ")
+    groups, lengths = [], list[Row]()
+    if marks is not None:
+        kinds = np.where(marks.check, "check", "control").tolist()
+        groups.append((kinds, marks.names, first + np.arange(len(kinds)), marks.places, marks.stddev))
+    for rows in problem.residuals.rows:
+        data = dict(zip(rows.residual.data, map(np.asarray, rows.data), strict=True))
+        at = [np.asarray(index) for index in rows.index]
+        if rows.residual.function is residuals.control_point.function and (own := at[0] < first).any():
+            of, stddev = at[0][own], 1 / np.einsum("nii->ni", data["whitening"][own])
+            groups.append((["control"] * len(of), [name(one) for one in of], of, data["position"][own], stddev))
+        if rows.residual.function is residuals.distance.function:
+            ends = [np.asarray(problem.points)[one] for one in at]
+            less = np.linalg.norm(ends[1] - ends[0], axis=1) - data["length"]
+            for one, two, length, by, sigma in zip(*at, data["length"], less, data["sigma"], strict=True):
+                pair = f"{name(one)}-{name(two)}"
+                lengths.append(Row("distance", pair, (float(length),), (float(by),), float(abs(by) / sigma)))
+    points = []
+    for kinds, names, of, places, stddev in groups:
+        found = found_at(problem, of, places, stddev)
+        columns = (places, found.difference, found.whitened, found.images, found.pixels)
+        for kind, own, place, by, *more in zip(kinds, names, *(x.tolist() for x in columns), strict=True):
+            points.append(Row(kind, own, tuple(place), tuple(by), *more))
+    return points + lengths
+
+
+def text(rows: Sequence[Row]) -> str:
+    """The report in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
+    lines, checks = [], [row.difference for row in rows if row.kind == "check"]
+    for names, lengths in ((("x", "y", "z"), False), (("measured", "found", "less"), True)):
+        if mine := [row for row in rows if (row.kind == "distance") == lengths]:
+            heads = "".join(f"{one:>11}" for one in names)
+            lines.append(f"{'found less measured':{NAME_WIDTH}}{'':9}{heads}{'images':>8}{'pixels':>8}{'sigmas':>8}")
+        for row in mine:
+            of = (*row.measured, row.measured[0] + row.difference[0], *row.difference) if lengths else row.difference
+            seen = f"{row.images:>8}{'' if lengths else format(row.pixels, '.2f'):>8}{row.sigmas:8.2f}"
+            numbers = "".join(f"{one:11.4f}" for one in of)
+            lines.append(f"{row.name[:NAME_WIDTH]:{NAME_WIDTH}} {row.kind:8}{numbers}{seen}")
+    if checks:
+        east, north, up = np.sqrt(np.mean(np.square(checks), axis=0))
+        lines.append(f"check points: RMS {np.hypot(east, north):.4f} horizontally, {up:.4f} vertically")
+    return "\n".join(lines)
+
+
+def write(path: str, rows: Sequence[Row]) -> None:
+    """Writes the report as CSV, and says so. Raises ProblemError: it cannot be written."""
+    out = io.StringIO()
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(("kind", "name", "x", "y", "z", "length", "dx", "dy", "dz", "dlength", "images", "pixels", "sigmas"))
+    for row in rows:
+        columns = [(*x, "") if len(x) == 3 else ("", "", "", *x) for x in (row.measured, row.difference)]
+        table.writerow((row.kind, row.name, *columns[0], *columns[1], row.images, row.pixels, row.sigmas))
+    with open_output(path) as file:
+        file.write(out.getvalue().encode())
+    print_line(f"wrote {path}")

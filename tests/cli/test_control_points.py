@@ -1,0 +1,188 @@
+"""Ground control points and RTK positions of a drone's block, by the command, against theory and COLMAP."""
+
+from __future__ import annotations
+
+import csv
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import support
+from drone_block import CHECKS, CONTROLS, RTK, SURVEYED, Block, drone_block
+
+import jaxba
+from jaxba import ProblemWarning
+from jaxba.cli.common import UsageError
+from jaxba.cli.constraints import surveyed
+from jaxba.cli.solve import run
+from jaxba.problem import geometry
+from jaxba.problem.marks import found_at
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory) -> Block:
+    return drone_block(tmp_path_factory.mktemp("block"))
+
+
+@pytest.fixture(scope="module")
+def solved(block) -> Block:
+    """The block with the model `out` and the report `survey.csv`."""
+    files = {"--constraints": "c.yaml", "--output": "out", "--survey": "survey.csv"}
+    options = [word for option, name in files.items() for word in (option, str(block.folder / name))]
+    assert run([str(block.folder / "model"), *options, "--policy", "ceres"]) == 0
+    return block
+
+
+def told(file: Path, folder: Path, **more) -> tuple:
+    """The problem of a model with what a file says, and its marks."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProblemWarning)
+        return surveyed(jaxba.read_colmap(folder), (), None, str(file), path=str(folder), **more)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_check_points_are_as_far_off_as_theory_says(solved):
+    """The covariance of the marks is theory's; the RMS of twenty points is within a factor of it."""
+    with open(solved.folder / "survey.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows] == ["control"] * CONTROLS + ["check"] * CHECKS
+    found = np.array([[float(row[axis]) for axis in ("dx", "dy", "dz")] for row in rows])
+    problem, _ = told(solved.folder / "c.yaml", solved.folder / "out")
+    theory = np.sqrt(np.diagonal(jaxba.covariance(problem).points[-CONTROLS - CHECKS :], axis1=1, axis2=2))
+    for axes in ([0, 1], [2]):
+        assert 0.6 < rms(found[CONTROLS:, axes]) / rms(theory[CONTROLS:, axes]) < 1.5
+    assert rms(found[:CONTROLS]) < SURVEYED  # which pixels pull on, and move by less than the survey's noise
+
+
+def test_the_written_model_has_no_point_more_or_less(solved):
+    before, after = (jaxba.read_colmap(solved.folder / name) for name in ("model", "out"))
+    assert (after.labels.points == before.labels.points).all()
+    assert (after.observations == before.observations).all()
+    assert (after.point_index == before.point_index).all()
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_mark_with_the_pixels_of_a_point_is_where_that_is(refined, solved, tmp_path):
+    """With BAL's lenses, whose pixels count from the principal point, and with COLMAP's."""
+    folder = solved.folder / "out"
+    model = jaxba.read_colmap(folder, refine_principal_point=True)
+    lines, points = ["local"], np.argsort(-np.bincount(model.point_index))[:3]
+    for at in np.flatnonzero(np.isin(model.point_index, points)):
+        x, y = model.observations[at]
+        lines.append(f"0 0 0 {x} {y} {model.labels.names[model.camera_index[at]]} {model.point_index[at]}")
+    (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
+    (tmp_path / "c.yaml").write_text(f"control_points: {{file: gcp_list.txt, check: [{', '.join(map(str, points))}]}}")
+    problem = jaxba.read_colmap(folder, refine_principal_point=refined)
+    found, marks = surveyed(problem, (), None, str(tmp_path / "c.yaml"), path=str(folder))
+    np.testing.assert_allclose(found.points[-3:], problem.points[list(map(int, marks.names))], atol=1e-3)
+
+
+def test_the_report_is_printed(solved, capsys):
+    args = [str(solved.folder / "out"), "--constraints", str(solved.folder / "c.yaml"), "--max-iterations", "0"]
+    assert run(args) == 0
+    out = capsys.readouterr().out
+    assert "gcp0                 control " in out
+    assert "gcp24                check " in out
+    assert "check points: RMS 0.0" in out
+
+
+def test_distances_and_points_by_id_are_in_the_report(block, tmp_path, capsys):
+    model = jaxba.read_colmap(block.folder / "model")
+    first, second = model.labels.points[:2].tolist()
+    length, place = float(np.linalg.norm(model.points[1] - model.points[0])), model.points[0].tolist()
+    text = f"distances: [{{points: [{first}, {second}], length: {length + 0.25}, stddev: 0.125}}]\n"
+    (tmp_path / "c.yaml").write_text(f"{text}control_points: {{positions: {{{first}: {place}}}, stddev: 0.1}}\n")
+    args = ["--constraints", str(tmp_path / "c.yaml"), "--max-iterations", "0", "--survey", str(tmp_path / "s.csv")]
+    assert run([str(block.folder / "model"), *args]) == 0
+    assert f"{length + 0.25:11.4f}{length:11.4f}    -0.2500" in capsys.readouterr().out
+    with open(tmp_path / "s.csv") as file:
+        point, distance = csv.DictReader(file)
+    assert (point["kind"], point["name"], float(point["dx"])) == ("control", str(first), 0)
+    assert int(point["images"]) == np.sum(model.point_index == 0)
+    seen = model.subset(model.point_index == 0)
+    errors = np.sum((seen.observations - geometry.project(seen)) ** 2, axis=1)
+    assert float(point["pixels"]) == pytest.approx(np.sqrt(errors.mean()))
+    assert (distance["name"], float(distance["sigmas"])) == (f"{first}-{second}", pytest.approx(2))
+
+
+def test_control_points_alone_move_the_scene_to_them(block, tmp_path):
+    """Without positions of images the scene is aligned with the marks; positions of a start are metres off."""
+    text = (block.folder / "c.yaml").read_text().split("\n")[1].replace("file: ", f"file: {block.folder}/")
+    (tmp_path / "c.yaml").write_text(text)
+    problem, marks = told(tmp_path / "c.yaml", block.folder / "model")
+    found = found_at(problem, problem.num_points + np.arange(-CONTROLS - CHECKS, 0), marks.places, marks.stddev)
+    assert np.abs(found.difference).max() < 5
+    assert marks.check.tolist() == [False] * CONTROLS + [True] * CHECKS
+
+
+@pytest.mark.extra
+def test_positions_give_the_scene_that_they_give_colmap(block, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
+    (tmp_path / "c.yaml").write_text(f"position_priors: {{file: {block.folder}/log.csv}}")
+    problem, _ = told(tmp_path / "c.yaml", block.folder / "model")
+    (rows,) = problem.residuals.rows
+    found = support.solve(problem).problem
+    model = pycolmap.Reconstruction(block.folder / "model")
+    config, priors = pycolmap.BundleAdjustmentConfig(), []
+    for at, place in zip(*map(np.asarray, (rows.index[0], rows.data[0])), strict=True):
+        image = model.image(int(problem.labels.images[at]))
+        config.add_image(image.image_id)
+        systems = pycolmap.PosePriorCoordinateSystem
+        known = {"position": place, "position_covariance": RTK**2 * np.eye(3), "coordinate_system": systems.CARTESIAN}
+        priors.append(pycolmap.PosePrior(pose_prior_id=int(at) + 1, corr_data_id=image.data_id, **known))
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    own = pycolmap.PosePriorBundleAdjustmentOptions()
+    pycolmap.create_pose_prior_bundle_adjuster(options, own, config, priors, model).solve()
+    points = np.array([model.point3D(int(one)).xyz for one in problem.labels.points])
+    np.testing.assert_allclose(found.points, points, atol=1e-3)
+    centers = [model.image(int(one)).projection_center() for one in problem.labels.images]
+    np.testing.assert_allclose(geometry.camera_centers(found.cameras), centers, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "message"),
+    [
+        ("EPSG:32632\n", "", "gcp_list.txt: has no points"),
+        ("1 2 3 4 5 a.jpg\n1 2 3 4 5 b.jpg\n", "", "gcp_list.txt line 1: is no coordinate system, such as EPSG:32632"),
+        ("# c\nlocal\n1 2 3 4 a.jpg\n", "", "gcp_list.txt line 3: has 5 words, not x y z px py image [name]"),
+        ("local\n1 2 3 4 x a.jpg\n", "", "gcp_list.txt line 2: 'x' is not a number (pixel y)"),
+        ("local\n1 2 3 4 5 a.jpg g\n1 2 4 4 5 b.jpg g\n", "", "gcp_list.txt line 3: g has another place than before"),
+        ("local\n1 2 3 4 5 a.jpg g\n1 2 3 4 6 a.jpg g\n", "", "gcp_list.txt line 3: g is in a.jpg twice"),
+        ("local\n1 2 3 4 5 a.jpg g\n", "", "none of the images is in the problem: a.jpg"),
+        ("local\n1 2 3 4 5 image0001.jpg g\n", "", "no point is in two images of the problem"),
+        ("nowhere\n1 2 3 4 5 image0001.jpg g\n1 2 3 4 5 image0002.jpg g\n", "", "coordinate system 'nowhere'"),
+        ("local\n1 2 3 4 5 image0001.jpg g\n", "check: [h]", "check: there is no point h; there are g"),
+        ("local\n1 2 3 4 5 image0001.jpg g\n", "pixels: 0", "pixels: must be a positive number, not 0"),
+        ("local\n1 2 3 4 5 image0001.jpg g\n", "sigma: 1", "unknown key sigma; there are file, check, pixels"),
+    ],
+)
+def test_mistakes_are_one_line_with_file_and_line(text, more, message, block, tmp_path):
+    (tmp_path / "gcp_list.txt").write_text(text)
+    (tmp_path / "c.yaml").write_text(f"control_points: {{file: gcp_list.txt, {more}}}\n")
+    with pytest.raises(UsageError) as caught:
+        told(tmp_path / "c.yaml", block.folder / "model")
+    assert message in str(caught.value)
+    assert "control_points: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_points_of_other_images_are_left_out(block, tmp_path):
+    lines = (block.folder / "gcp_list.txt").read_text().split("\n")[1:-1]
+    mine = [line for line in lines if line.endswith("gcp0")]
+    text = ["EPSG:32632", *mine, mine[0].replace("gcp0", "once"), mine[1].replace("image", "other")]
+    (tmp_path / "gcp_list.txt").write_text("\n".join(text))
+    (tmp_path / "c.yaml").write_text("control_points: {file: gcp_list.txt, check: gcp0}\n")
+    folder = block.folder / "model"
+    with pytest.warns(ProblemWarning) as notes:
+        problem, marks = surveyed(jaxba.read_colmap(folder), (), None, str(tmp_path / "c.yaml"), path=str(folder))
+    said = "\n".join(str(one.message) for one in notes)
+    assert "left out pixels of 1 image that the problem does not have: other" in said
+    assert "left out 1 point in fewer than two images of the problem: once" in said
+    assert marks.names == ("gcp0",)
+    assert not problem.residuals
+    with pytest.raises(UsageError, match="pixels of 1 image that the problem does not have"):
+        told(tmp_path / "c.yaml", folder, strict=True)

@@ -1,0 +1,157 @@
+"""Surveys in the file of `--constraints`: positions on the earth."""
+
+from __future__ import annotations
+
+import functools
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import support
+from PIL import Image
+
+import jaxba
+from jaxba import ProblemWarning
+from jaxba.cli.common import UsageError
+from jaxba.cli.constraints import constrained
+from jaxba.cli.solve import run
+from jaxba.problem import geometry
+from jaxba.problem.labels import Labels
+
+ORIGIN = (8.5, 47.3, 500.0)
+"""Longitude, latitude and height of the scene's origin."""
+
+
+def on_earth(places: np.ndarray) -> np.ndarray:
+    """Latitude, longitude and height of metres east, north and up."""
+    lon, lat, height = ORIGIN
+    pipeline = (
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={lon} +lat_0={lat} +h_0={height} "
+        "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    lon, lat, height = pyproj.Transformer.from_pipeline(pipeline).transform(*places.T)
+    return np.stack([lat, lon, height], axis=1)
+
+
+@functools.cache
+def _solved() -> jaxba.BundleProblem:
+    return support.solve(support.tiny()).problem
+
+
+@pytest.fixture
+def scene(tmp_path) -> tuple[Path, jaxba.BundleProblem, np.ndarray]:
+    """A solved model of six images, and where the images are on the earth: another frame of ten times its size."""
+    jaxba.write_colmap(_solved(), folder := tmp_path / "model")
+    problem = jaxba.read_colmap(folder)
+    turn = geometry.rotation_matrices(np.array([[0.3, -0.2, 1.0]]))[0]
+    return folder, problem, on_earth(10 * geometry.camera_centers(problem.cameras) @ turn.T)
+
+
+def distances(places: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(places[:, None] - places, axis=2)
+
+
+def write_log(path: Path, problem: jaxba.BundleProblem, places: np.ndarray) -> None:
+    rows = zip((*problem.labels.names, "other.jpg"), [*places.tolist(), [0, 0, 0]], strict=True)
+    path.write_text("image,lat,lon,alt,accuracy\n" + "".join(f"{n},{a!r},{b!r},{c!r},0.05\n" for n, (a, b, c) in rows))
+
+
+def write_database(path: Path, problem: jaxba.BundleProblem, places: np.ndarray) -> None:
+    base = sqlite3.connect(path)
+    base.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
+    base.execute(
+        "CREATE TABLE pose_priors (corr_data_id INTEGER, corr_sensor_type INTEGER, position BLOB,"
+        " position_covariance BLOB, coordinate_system INTEGER)"
+    )
+    for at, (name, place) in enumerate(zip(problem.labels.names, places, strict=True)):
+        base.execute("INSERT INTO images VALUES (?, ?)", (at, name))
+        blobs = place.tobytes(), (0.05**2 * np.eye(3)).tobytes()
+        base.execute("INSERT INTO pose_priors VALUES (?, 0, ?, ?, 0)", (at, *blobs))
+    base.commit()
+    base.close()
+
+
+def write_photos(folder: Path, problem: jaxba.BundleProblem, places: np.ndarray) -> None:
+    folder.mkdir()
+    for name, (lat, lon, height) in zip(problem.labels.names, places, strict=True):
+        image = Image.new("RGB", (4, 3))
+        exif = image.getexif()
+        exif[0x8825] = {1: "N", 2: (lat, 0.0, 0.0), 3: "E", 4: (lon, 0.0, 0.0), 5: b"\0", 6: height}
+        image.save(folder / name, exif=exif)
+
+
+@pytest.mark.parametrize("source", ["positions", "file", "database", "photos", "projected"])
+def test_positions_on_the_earth_make_a_scene_in_metres(source, scene, tmp_path):
+    _, problem, places = scene
+    names, text = problem.labels.names, {"file": "file: log.csv", "database": "database: d.db"}
+    text["photos"] = "photos: images, stddev: 0.05"
+    rows = ", ".join(f"{name}: {place}" for name, place in zip(names, places.tolist(), strict=True))
+    inline = f"positions: {{{rows}}}, crs: EPSG:4326, stddev: 0.05"
+    write_log(tmp_path / "log.csv", problem, places)
+    write_database(tmp_path / "d.db", problem, places)
+    write_photos(tmp_path / "images", problem, places)
+    crs = "crs: EPSG:32632\n" if source == "projected" else ""
+    (tmp_path / "c.yaml").write_text(f"{crs}position_priors: {{{text.get(source, inline)}}}\n")
+    with pytest.warns(ProblemWarning) as notes:
+        found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    said = "\n".join(str(one.message) for one in notes)
+    assert ("left out positions of 1 image that the problem does not have: other.jpg" in said) == (source == "file")
+    assert f"the scene is in {'EPSG:32632' if crs else 'metres east, north and up of latitude 47.'}" in said
+    (rows,) = found.residuals.rows
+    np.testing.assert_allclose(np.asarray(rows.data[1]), np.tile(np.eye(3) / 0.05, (6, 1, 1)), atol=1e-9)
+    centers, before = geometry.camera_centers(found.cameras), geometry.camera_centers(problem.cameras)
+    np.testing.assert_allclose(
+        distances(centers), 10 * distances(before), rtol={"projected": 1e-3, "photos": 1e-4}.get(source, 1e-9)
+    )
+    if crs:
+        expected = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*places.T[:2])
+        np.testing.assert_allclose(centers[:, :2], np.stack(expected, axis=1), atol=0.05)
+
+
+def test_images_are_found_by_the_names_of_their_files(scene, tmp_path):
+    _, problem, places = scene
+    labels = problem.labels
+    write_log(tmp_path / "log.csv", problem, places)
+    problem = problem.replace(
+        labels=Labels(tuple(f"flight/{name}" for name in labels.names), labels.images, labels.lenses, labels.points)
+    )
+    (tmp_path / "c.yaml").write_text("position_priors: {file: log.csv}\n")
+    with pytest.warns(ProblemWarning):
+        found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    assert found.residuals.rows[0].index[0].tolist() == list(range(6))
+
+
+def test_the_written_model_stays_in_metres(scene, tmp_path, capsys):
+    folder, problem, places = scene
+    write_log(tmp_path / "log.csv", problem, places)
+    (tmp_path / "c.yaml").write_text("position_priors: {file: log.csv}\n")
+    assert run([str(folder), "--constraints", str(tmp_path / "c.yaml"), "--output", str(tmp_path / "out")]) == 0
+    assert "c.yaml: position_priors: the scene is in metres east, north and up of" in capsys.readouterr().out
+    centers = geometry.camera_centers(jaxba.read_colmap(tmp_path / "out").cameras)
+    np.testing.assert_allclose(distances(centers), distances(10 * geometry.camera_centers(problem.cameras)), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("crs: EPSG:4326", "crs: EPSG:4326 is no projected coordinate system in metres"),
+        ("position_priors: {file: gone.csv}", "position_priors: cannot read"),
+        ("position_priors: {file: [1]}", "position_priors: file: must be a name, not"),
+        ("position_priors: {file: bad.csv}", "bad.csv line 2: 'north' is not a number (latitude)"),
+        ("position_priors: {file: log.csv, crs: EPSG:32632}", "crs: latitudes and longitudes are not of EPSG:32632"),
+        ("position_priors: {file: log.csv, crs: [1]}", "crs: must be a name, not"),
+        ("position_priors: {database: log.csv}", "log.csv: is no database of COLMAP with positions"),
+        ("position_priors: {photos: .}", "no photo of the model there has a GPS position"),
+        ("position_priors: {file: log.csv, database: d.db}", "position_priors: unknown key database; there are file"),
+    ],
+)
+def test_mistakes_are_one_line_that_names_the_key(text, message, scene, tmp_path):
+    write_log(tmp_path / "log.csv", scene[1], scene[2])
+    (tmp_path / "bad.csv").write_text("image,lat,lon,alt\nimage0001.jpg,north,1,2\n")
+    (tmp_path / "c.yaml").write_text(f"{text}\n")
+    with pytest.raises(UsageError) as caught:
+        constrained(scene[1], (), None, str(tmp_path / "c.yaml"))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,196 @@
+"""Positions on the earth in metric frames, and the files that have positions of images."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxba import ProblemError
+from jaxba.io.geodesy import Frame, in_frame, projected
+from jaxba.io.positions import read_database, read_photos, read_table
+
+PLACES = np.array([[8.5, 47.3, 500.0], [8.51, 47.31, 620.0], [8.52, 47.29, 480.0]])
+
+
+def geocentric(places: np.ndarray) -> np.ndarray:
+    """The textbook's formula for WGS 84."""
+    (lon, lat), h = np.radians(places[:, :2]).T, places[:, 2]
+    a, f = 6378137.0, 1 / 298.257223563
+    e2 = f * (2 - f)
+    n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    return np.stack(
+        [
+            (n + h) * np.cos(lat) * np.cos(lon),
+            (n + h) * np.cos(lat) * np.sin(lon),
+            (n * (1 - e2) + h) * np.sin(lat),
+        ],
+        axis=1,
+    )
+
+
+def test_east_north_and_up_are_those_of_the_textbook():
+    found, frame = in_frame(PLACES, "EPSG:4326")
+    middle = np.array(frame.origin)
+    assert np.abs(found.mean(axis=0)).max() < 0.5
+    step = np.eye(3) * [1e-6, 1e-6, 1e-2]
+    axes = geocentric(middle + step) - geocentric(middle - step)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    np.testing.assert_allclose(found, (geocentric(PLACES) - geocentric(middle[None])) @ axes.T, atol=1e-4)
+
+
+def test_a_projected_system_is_a_frame_and_goes_back():
+    found, frame = in_frame(PLACES, "EPSG:4326", projected("EPSG:32632"))
+    assert frame == Frame("EPSG:32632")
+    assert (found[:, 2] == PLACES[:, 2]).all()
+    assert abs(found[0, 0] - (500_000 - 0.5 * np.cos(np.radians(47.3)) * 111_320 * 0.9996)) < 100  # east of 9 degrees
+    local, own = in_frame(PLACES, "EPSG:4326")
+    np.testing.assert_allclose(in_frame(found, "EPSG:32632", own)[0], local, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("crs", "message"),
+    [("EPSG:9", "there is no coordinate system 'EPSG:9'"), ("EPSG:4326", "EPSG:4326 is no projected"), ("ft", "'ft'")],
+)
+def test_what_is_no_frame_is_refused(crs, message):
+    with pytest.raises(ValueError, match=message):
+        projected(crs)
+
+
+def test_a_latitude_beyond_the_pole_is_no_place():
+    with pytest.raises(ValueError, match=r"\[8\.0, 95\.0, 0\.0\] is no place of WGS 84"):
+        in_frame(np.array([[8.0, 95.0, 0.0]]), "EPSG:4326")
+
+
+def test_without_pyproj_a_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(ValueError, match=r"^coordinate systems need pyproj: pip install jaxba\[survey\]$"):
+        in_frame(PLACES, "EPSG:4326")
+
+
+TABLES = {
+    "plain": "Image,Latitude,Longitude,Altitude\na.jpg,47.3,8.5,500\nb.jpg,47.31,8.51,620\n",
+    "gaps": "filename;lat;lon;height;roll\na.jpg;47.3;8.5;500;1\nz.jpg;;;;\nb.jpg;47.31;8.51;620;1\n",
+    "units": "imagename,longitude [deg],latitude [deg],altitude (m)\r\na.jpg,8.5,47.3,500\r\nb.jpg,8.51,47.31,620\r\n",
+    "metashape": "# CoordinateSystem: WGS 84\n#Label,X/Longitude,Y/Latitude,Z/Altitude,Error_(m)\n"
+    "a.jpg,8.5,47.3,500,1\nb.jpg,8.51,47.31,620,1\n# Total Error\n",
+}
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_flight_logs_are_tables_with_the_usual_names(table, tmp_path):
+    (tmp_path / "log.csv").write_text(TABLES[table])
+    names, places, covariances, crs = read_table(tmp_path / "log.csv")
+    assert names == ["a.jpg", "b.jpg"]
+    assert (places == PLACES[:2]).all()
+    assert covariances is None
+    assert crs == "EPSG:4326"
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "variances"),
+    [
+        ("sigma_x,sigma_y,sigma_z", "1,2,3", [1, 4, 9]),
+        ("accuracy horizontal [meter],accuracy vertical [meter]", "2,3", [4, 4, 9]),
+        ("accuracy", "2", [4, 4, 4]),
+    ],
+)
+def test_columns_of_accuracy_are_standard_deviations(columns, cells, variances, tmp_path):
+    (tmp_path / "log.csv").write_text(f"image,easting,northing,z,{columns}\na.jpg,1,2,3,{cells}\n")
+    _, places, covariances, crs = read_table(tmp_path / "log.csv")
+    assert places.tolist() == [[1, 2, 3]]
+    assert covariances.tolist() == [np.diag(variances).tolist()]
+    assert crs == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a.jpg,1,2,3\n", "log.csv: no line names the columns"),
+        ("image,lat,lon\na.jpg,1,2\n", "log.csv line 1: there is no column height"),
+        ("image,lat,lon,alt\n\na.jpg,1,x,3\n", "log.csv line 3: 'x' is not a number (longitude)"),
+        ("image,lat,lon,alt\na.jpg,1,2\n", "log.csv line 2: has 3 columns, fewer than the line of names"),
+        ("image,lat,lon,alt,accuracy\na.jpg,1,2,3,0\n", "log.csv line 2: an accuracy is not positive"),
+        ("image,lat,lon,alt\n", "log.csv: has no positions"),
+    ],
+)
+def test_a_bad_table_is_one_line_with_file_and_line(text, message, tmp_path):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(ProblemError) as caught:
+        read_table(tmp_path / "log.csv")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def old_database(path, system: int = 0) -> None:
+    """Positions as COLMAP 3.12 stores them, beside an image that has none."""
+    base = sqlite3.connect(path)
+    base.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
+    base.execute("CREATE TABLE pose_priors (image_id INTEGER, position BLOB, coordinate_system INTEGER)")
+    base.executemany("INSERT INTO images VALUES (?, ?)", [(1, "a.jpg"), (2, "b.jpg"), (3, "c.jpg")])
+    rows = [(2, PLACES[1, [1, 0, 2]].tobytes(), system), (1, PLACES[0, [1, 0, 2]].tobytes(), 0)]
+    base.executemany("INSERT INTO pose_priors VALUES (?, ?, ?)", [*rows, (3, np.full(3, np.nan).tobytes(), 0)])
+    base.commit()
+    base.close()
+
+
+def test_a_database_of_an_earlier_colmap_has_positions_by_image(tmp_path):
+    old_database(tmp_path / "d.db")
+    names, places, covariances, crs = read_database(tmp_path / "d.db")
+    assert (names, covariances, crs) == (["a.jpg", "b.jpg"], None, "EPSG:4326")
+    assert (places == PLACES[:2]).all()
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("geographic", [True, False])
+def test_a_database_of_pycolmap_has_positions_and_covariances(geographic, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    base = pycolmap.Database.open(str(tmp_path / "d.db"))
+    base.write_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=10, height=10, params=[9, 5, 5]))
+    systems = pycolmap.PosePriorCoordinateSystem
+    covariances = np.array([np.diag([1.0, 2.0, 3.0]), np.eye(3) + 0.2])
+    for at, name in enumerate(("a.jpg", "b.jpg")):
+        number = base.write_image(pycolmap.Image(name=name, camera_id=1))
+        prior = pycolmap.PosePrior(
+            position=PLACES[at, [1, 0, 2]] if geographic else PLACES[at], position_covariance=covariances[at]
+        )
+        prior.coordinate_system = systems.WGS84 if geographic else systems.CARTESIAN
+        prior.corr_data_id = base.read_image(number).data_id
+        base.write_pose_prior(prior)
+    base.close()
+    names, places, found, crs = read_database(tmp_path / "d.db")
+    assert (names, crs) == (["a.jpg", "b.jpg"], "EPSG:4326" if geographic else "")
+    assert (places == PLACES[:2]).all()
+    assert (found == covariances).all()
+
+
+def test_other_databases_are_one_line(tmp_path):
+    (tmp_path / "text.db").write_text("no database, but long enough to be one" * 10)
+    old_database(tmp_path / "mixed.db", 1)
+    for name, message in (
+        ("gone.db", "gone.db: is no database of COLMAP with positions: unable to open"),
+        ("text.db", "text.db: is no database of COLMAP with positions: file is not a database"),
+        ("mixed.db", "mixed.db: has positions of different coordinate systems"),
+    ):
+        with pytest.raises(ProblemError, match=message):
+            read_database(tmp_path / name)
+
+
+def test_photos_have_the_position_of_their_camera(tmp_path):
+    for name, gps in {
+        "a.jpg": {1: "S", 2: (47.0, 18.0, 0.0), 3: "W", 4: (8.0, 30.0, 36.0), 5: b"\x00", 6: 500.0},
+        "b.jpg": {1: "N", 2: (47.0, 18.0, 0.0), 3: "E", 4: (8.0, 30.0, 36.0), 5: b"\x01", 6: 2.5},
+        "c.jpg": {1: "N"},
+    }.items():
+        image = Image.new("RGB", (4, 3))
+        exif = image.getexif()
+        exif[0x8825] = gps
+        image.save(tmp_path / name, exif=exif)
+    names, places, _, crs = read_photos(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
+    assert (names, crs) == (["a.jpg", "b.jpg"], "EPSG:4326")
+    np.testing.assert_allclose(places, [[-8.51, -47.3, 500], [8.51, 47.3, -2.5]], atol=1e-9)
+    with pytest.raises(ProblemError, match="no photo of the model there has a GPS position"):
+        read_photos(tmp_path, ["c.jpg"])
