@@ -22,15 +22,7 @@ from test_layout import (
     sum_by_ranks,
 )
 
-from jaxba import (
-    Ceres,
-    Loss,
-    StepOptions,
-    Tolerances,
-    build_layout,
-    random_scene,
-    solve_loop,
-)
+from jaxba import Ceres, Loss, SolveOptions, StepOptions, Tolerances, build_layout, prepare, random_scene, solve_loop
 from jaxba.lm.step import state_of
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem.options import Refinement
