@@ -25,11 +25,8 @@ DEFAULT_SOLVERS = "ceres,ceres+refine3,guarded,classic"
 DEFAULT_OUT = "runs/bench"
 """Folder of the first benchmark whose folder is not given; that of the next is called `runs/bench-2`."""
 
-WIDTH = 100
-"""Width of the table in characters."""
-
-_VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)
-"""A variable that `os.path.expandvars` expands."""
+WIDTH = 100  # width of the table in characters
+_VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)  # A variable that `os.path.expandvars` expands
 
 
 @options

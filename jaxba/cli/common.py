@@ -25,8 +25,7 @@ from jaxba.typing import InputError
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
 
-CACHE_VARIABLE = "JAXBA_CACHE"
-"""Environment variable with the folder of compiled programs; `off` disables the cache."""
+CACHE_VARIABLE = "JAXBA_CACHE"  # environment variable with the folder of compiled programs; `off` disables the cache
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""

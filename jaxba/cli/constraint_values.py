@@ -15,8 +15,7 @@ from jaxtyping import Float
 from jaxba.problem.checks import SHOWN
 from jaxba.problem.losses import Loss
 
-NAMED = 3
-"""Names that a message gives of a longer list."""
+NAMED = 3  # names that a message gives of a longer list
 
 
 def names_of(names: Sequence[str]) -> str:

@@ -31,8 +31,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 
-EVALUATE = "evaluate"
-"""First argument of the subcommand; a folder of this name can be given as ./evaluate."""
+EVALUATE = "evaluate"  # first argument of the subcommand; a folder of this name can be given as ./evaluate
 
 options(Build)
 

@@ -17,13 +17,11 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 
 import tyro
 
-BAD_INPUT = 2
-"""Exit status for invalid input."""
+BAD_INPUT = 2  # exit status for invalid input
 
 Arguments = TypeVar("Arguments")
 
-_COLORS = re.compile(r"\x1b\[[\d;]*m")
-"""Control sequences that colour text on a terminal."""
+_COLORS = re.compile(r"\x1b\[[\d;]*m")  # control sequences that colour text on a terminal
 
 
 @dataclass_transform(frozen_default=True)

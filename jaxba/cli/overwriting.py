@@ -11,8 +11,7 @@ from jaxba.cli.common import UsageError
 from jaxba.io.files import StrPath, display_name, sidecar_path, stream_number
 from jaxba.io.formats import files_of
 
-PROBLEM = "a file of the problem"
-"""What a message calls a file of a problem that is read."""
+PROBLEM = "a file of the problem"  # what a message calls a file of a problem that is read
 
 
 def check_apart(written: Mapping[str, Iterable[StrPath | None]], read: Mapping[str, Iterable[StrPath | None]]) -> None:

@@ -13,8 +13,7 @@ from jaxba.cli.options import options
 FULL, FAST = "full", "fast"
 """Names of the presets."""
 
-REPORT = "paper.md"
-"""File of the report, unless `--report` names another."""
+REPORT = "paper.md"  # file of the report, unless `--report` names another
 
 
 @options

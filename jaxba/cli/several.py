@@ -25,8 +25,7 @@ from jaxba.solver.many import Result, solve_many
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import Solution
 
-COSTS = "costs.csv"
-"""Name of the file of costs in the folder of solutions."""
+COSTS = "costs.csv"  # name of the file of costs in the folder of solutions
 
 FOR_ONE = (
     *("log", "survey", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices"),
@@ -34,8 +33,7 @@ FOR_ONE = (
 )
 """Options of a single problem."""
 
-PROGRESS_S = 0.2, 10.0
-"""Seconds between lines of progress on a terminal, where each replaces the last, and elsewhere."""
+PROGRESS_S = 0.2, 10.0  # seconds between lines of progress on a terminal, where each replaces the last, and elsewhere
 
 
 class Row(NamedTuple):

@@ -31,8 +31,7 @@ from jaxba.results.retriangulate import retriangulate
 POSITIONS = "positions: {name or id: [x, y, z]}, or file, database or photos; crs, stddev, loss, loss_scale and align"
 """What the key `position_priors` holds."""
 
-SOURCES = ("file", "database", "photos")
-"""Keys that say where positions are read."""
+SOURCES = ("file", "database", "photos")  # keys that say where positions are read
 
 
 def with_positions(

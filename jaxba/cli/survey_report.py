@@ -16,8 +16,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.labels import part_name
 from jaxba.problem.marks import Marks, found_at
 
-NAME_WIDTH = 20
-"""Characters of a name in the text."""
+NAME_WIDTH = 20  # characters of a name in the text
 
 
 class Row(NamedTuple):

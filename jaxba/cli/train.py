@@ -17,20 +17,11 @@ from jaxba.runtime.interrupt import Interrupt
 if TYPE_CHECKING:
     from jaxba.bench.tables import Table
 
-DEFAULT_CONFIG = "default"
-"""Default preset of a new run."""
-
-POLICY = "policy.safetensors"
-"""File of the best policy."""
-
-OF_AGENT = "policy-{}.safetensors"
-"""File of an agent's policy, if there are several agents."""
-
-PAGE = "report.html"
-"""File with curves, episodes and the table, interactive."""
-
-FILE_WIDTH = 160
-"""Width of the table in characters if the output is not a terminal."""
+DEFAULT_CONFIG = "default"  # default preset of a new run
+POLICY = "policy.safetensors"  # file of the best policy
+OF_AGENT = "policy-{}.safetensors"  # file of an agent's policy, if there are several agents
+PAGE = "report.html"  # file with curves, episodes and the table, interactive
+FILE_WIDTH = 160  # width of the table in characters if the output is not a terminal
 
 
 @options

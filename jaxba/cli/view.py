@@ -22,11 +22,8 @@ from jaxba.solver.drivers import IterationRecord, Watch
 if TYPE_CHECKING:
     from jaxba.viewer.page import Viewer
 
-VIEWER = "jaxba.viewer.extra"
-"""Module that needs viser."""
-
-PAUSE_S = 0.3
-"""Least time between two updates of the page."""
+VIEWER = "jaxba.viewer.extra"  # module that needs viser
+PAUSE_S = 0.3  # least time between two updates of the page
 
 
 @options

@@ -21,8 +21,7 @@ from jaxba.problem.geometry import angle_axis, are_rotations, rotation_matrices
 from jaxba.problem.labels import part_name
 from jaxba.typing import LARGEST_COUNT
 
-HEADER = b"# Bundle file v0.3"
-"""First line of every file of this version."""
+HEADER = b"# Bundle file v0.3"  # first line of every file of this version
 
 _CAMERA = ("f", "k1", "k2", *(f"R{row}{column}" for row in "123" for column in "123"), "t1", "t2", "t3")
 

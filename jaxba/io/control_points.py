@@ -13,11 +13,8 @@ from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import ProblemError
 
-FIELDS = ("x", "y", "z", "pixel x", "pixel y")
-"""The numbers at the beginning of each line."""
-
-LOCAL = "local"
-"""First line of a file whose coordinates are those of the scene's frame."""
+FIELDS = ("x", "y", "z", "pixel x", "pixel y")  # the numbers at the beginning of each line
+LOCAL = "local"  # first line of a file whose coordinates are those of the scene's frame
 
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})([NS])?", re.IGNORECASE)
 

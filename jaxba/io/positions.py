@@ -18,8 +18,7 @@ from jaxba.io.files import StrPath, display_name, reason
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import ProblemError
 
-WGS84 = "EPSG:4326"
-"""What longitudes and latitudes are of, if nothing else is said."""
+WGS84 = "EPSG:4326"  # what longitudes and latitudes are of, if nothing else is said
 
 COLUMNS = {
     "name": ("image", "filename", "file", "label", "name", "photo", "imagename", "imagefile", "sourcefile"),
@@ -39,8 +38,7 @@ COLUMNS = {
 }
 """Columns of a table by their names, in letters alone and without units in brackets."""
 
-DEVIATIONS = (("sx", "sy", "sz"), ("sxy", "sxy", "sz"), ("s", "s", "s"))
-"""Columns that say how accurate a position is."""
+DEVIATIONS = (("sx", "sy", "sz"), ("sxy", "sxy", "sz"), ("s", "s", "s"))  # columns that say how accurate a position is
 
 GPS, ABOVE_SEA = 0x8825, 5
 """Block of the EXIF data of a photo with its position, and the field that is 1 below sea level."""

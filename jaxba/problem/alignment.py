@@ -18,8 +18,7 @@ SIGNIFICANT = 3.0
 """Standard deviations by which positions must spread in a direction before they say anything about scale or rotation:
 three images on a line with this spread across it determine the roll about it to some 0.2 radians, 30 to 0.06."""
 
-MOST = 0.75
-"""Share of the images that must fit: it is noted if fewer do."""
+MOST = 0.75  # share of the images that must fit: it is noted if fewer do
 
 DOUBTFUL, MISFIT = 2.0, 5.0
 """Distance, over that of noise, from which other axes or units are tried, and from which positions do not fit."""

@@ -20,15 +20,11 @@ from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import Rigs, checked_rigs
 from jaxba.typing import AnyArray, ArrayRecord, InputError, register_pytree
 
-CAMERA_SIZE = 9
-"""Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
-
-POINT_SIZE = 3
-"""Parameters of a point: x, y, z in scene units."""
+CAMERA_SIZE = 9  # parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2
+POINT_SIZE = 3  # parameters of a point: x, y, z in scene units
 
 
-NONE = np.zeros(0, np.int32)
-"""No index."""
+NONE = np.zeros(0, np.int32)  # no index
 
 
 class ProblemError(InputError):

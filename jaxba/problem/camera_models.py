@@ -16,11 +16,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-FOV_SMALL = 1e-4
-"""Squared radius or squared omega below which FOV is a series, as in COLMAP."""
+FOV_SMALL = 1e-4  # squared radius or squared omega below which FOV is a series, as in COLMAP
 
-NEARLY_ON_AXIS = 1e-20
-"""`r^2 / z^2` below which a fisheye projects as a pinhole: the difference is below rounding."""
+NEARLY_ON_AXIS = 1e-20  # `r^2 / z^2` below which a fisheye projects as a pinhole: the difference is below rounding
 
 Pixel = tuple[Any, Any]
 

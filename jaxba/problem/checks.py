@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxba.runtime.numerics import TRACED
 
-SHOWN = 60
-"""Characters of a wrong value that a message shows."""
+SHOWN = 60  # characters of a wrong value that a message shows
 
 
 def shown(value: Any, longest: int = SHOWN) -> str:

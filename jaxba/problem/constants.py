@@ -12,8 +12,7 @@ from jaxba.problem.checks import plain_array
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-ROTATION = np.array([True, True, True, False, False, False])
-"""The numbers of a pose that are its rotation."""
+ROTATION = np.array([True, True, True, False, False, False])  # the numbers of a pose that are its rotation
 
 
 @register_pytree

@@ -19,8 +19,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemWarning
 from jaxba.problem.labels import part_names
 
-NAMED = 3
-"""Most images that a message names."""
+NAMED = 3  # most images that a message names
 
 _OFF_AXIS = np.array([0.1, 0.2, 1.0])
 

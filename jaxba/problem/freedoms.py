@@ -22,8 +22,7 @@ from jaxba.problem.preprocess import far_middle, middle_and_extent, observed, sh
 from jaxba.problem.rigs import first_of_group
 from jaxba.problem.row_changes import changes_by_similarity
 
-SIMILARITY = 7
-"""Degrees of freedom of a similarity."""
+SIMILARITY = 7  # degrees of freedom of a similarity
 
 RESOLVED = 1e-7
 """Smallest change that is not rounding, of lengths as shares of the scene's extent and of radians. What a cost knows of

@@ -20,8 +20,7 @@ from jaxba.problem.preprocess import far_middle, observed, shift
 
 Gauge = Literal["free", "two-cameras", "three-points"]
 
-LEVER = 1e-6
-"""Smallest step of a number (radians, extents of the scene) by which it fixes a direction."""
+LEVER = 1e-6  # smallest step of a number (radians, extents of the scene) by which it fixes a direction
 
 
 def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:

@@ -18,8 +18,7 @@ from jaxba.problem.camera_models import BAL
 Array = np.ndarray | jax.Array
 """Arrays of a problem; every result here is a NumPy array."""
 
-CHUNK = 1 << 19
-"""Observations processed at once: some 100 MB of temporaries, measured no slower than larger chunks."""
+CHUNK = 1 << 19  # observations processed at once: some 100 MB of temporaries, measured no slower than larger chunks
 
 COLMAP_FLIP = np.array([1.0, -1.0, -1.0])
 """Signs from BAL's axes (looks down -z, y upwards) to COLMAP's (+z, y downwards), and back; first two: pixels."""
@@ -27,8 +26,7 @@ COLMAP_FLIP = np.array([1.0, -1.0, -1.0])
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of `R R^T - I` that counts as rounding in a file: Bundler writes 11 digits, KITTI 7, others fewer."""
 
-_HALF_TURN_X = np.array([1.0, 0.0, 0.0, 0.0])
-"""The rotation `diag(COLMAP_FLIP)` as a quaternion xyzw."""
+_HALF_TURN_X = np.array([1.0, 0.0, 0.0, 0.0])  # the rotation `diag(COLMAP_FLIP)` as a quaternion xyzw
 
 
 def rotation_matrices(vectors: Float[Array, "n 3"]) -> Float[np.ndarray, "n 3 3"]:

@@ -22,8 +22,7 @@ from jaxba.problem.labels import part_name
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
 
-GROUPS = ("focal", "principal_point", "distortion")
-"""Groups of the numbers of a lens, as COLMAP's options name them."""
+GROUPS = ("focal", "principal_point", "distortion")  # groups of the numbers of a lens, as COLMAP's options name them
 
 
 def hold(

@@ -18,8 +18,7 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 POSE_SIZE = 6
 """Parameters of a pose: angle-axis (radians) and translation (scene units). Those of the lens follow in a camera."""
 
-LENS_SIZE = len(BAL)
-"""Parameters of a BAL lens: f (pixels), k1, k2."""
+LENS_SIZE = len(BAL)  # parameters of a BAL lens: f (pixels), k1, k2
 
 
 @register_pytree

@@ -46,8 +46,7 @@ _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
     "tukey": _tukey,
 }
 
-NAMES = tuple(_SHAPES)
-"""Names of the known losses."""
+NAMES = tuple(_SHAPES)  # names of the known losses
 
 
 @jax.tree_util.register_static

@@ -22,8 +22,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.residuals import Rows, residual
 from jaxba.problem.row_value import AXES
 
-LEAST_VARIANCE = 1e-200
-"""Smallest eigenvalue of a covariance whose inverse can be computed with."""
+LEAST_VARIANCE = 1e-200  # smallest eigenvalue of a covariance whose inverse can be computed with
 
 
 def with_position_priors(

@@ -21,11 +21,8 @@ Intrinsics = Literal["free", "fixed"]
 LensStep = Literal["file", "pixels"]
 PointStarts = Literal["step", "rays"]
 
-DIAGONAL_MINIMUM = 1e-6
-"""Smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal."""
-
-DIAGONAL_MAXIMUM = 1e32
-"""Largest diagonal entry that damping multiplies. Source: Ceres max_lm_diagonal."""
+DIAGONAL_MINIMUM = 1e-6  # smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal
+DIAGONAL_MAXIMUM = 1e32  # largest diagonal entry that damping multiplies. Source: Ceres max_lm_diagonal
 
 
 @dataclass(frozen=True)

@@ -10,18 +10,14 @@ from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, tr
 from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity, transformed
 
-SIZE = 100.0
-"""Size of a normalised scene. Source: Ceres `BALProblem::Normalize`."""
-
-MIN_DEPTH = 0.1
-"""Smallest depth of an observation in a scene of that size. Source: rootba's experiments."""
+SIZE = 100.0  # size of a normalised scene. Source: Ceres `BALProblem::Normalize`
+MIN_DEPTH = 0.1  # smallest depth of an observation in a scene of that size. Source: rootba's experiments
 
 FAR = 10.0
 """Distance of a scene from the origin, relative to its extent, from which it is solved around the origin. BAL rotations
 are about the origin: far from it, small rotations are large motions, which distorts the damping and loses digits."""
 
-MIN_TRACK = 2
-"""Fewest observations that determine a point. Source: rootba, which drops points with fewer."""
+MIN_TRACK = 2  # fewest observations that determine a point. Source: rootba, which drops points with fewer
 
 
 def normalize(problem: BundleProblem, size: float = SIZE) -> BundleProblem:

@@ -26,8 +26,7 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 POSE, LENS, POINT, PIXELS = "pose", "lens", "point", "pixels"
 """Names of unknowns that every problem has, and of the costs of its observations."""
 
-SECOND = "_2"
-"""Ending of the names of a second camera's unknowns."""
+SECOND = "_2"  # ending of the names of a second camera's unknowns
 
 
 @dataclass(frozen=True)

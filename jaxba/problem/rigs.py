@@ -23,8 +23,7 @@ from jaxba.problem.checks import plain_array, real_numbers
 from jaxba.problem.intrinsics import Lenses
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-EXTRINSICS_SIZE = 6
-"""Numbers of the extrinsics of a camera: angle-axis (radians) of M and m (scene units)."""
+EXTRINSICS_SIZE = 6  # numbers of the extrinsics of a camera: angle-axis (radians) of M and m (scene units)
 
 LARGEST_DISAGREEMENT = 1e-6
 """Of the rotations (radians) and relative translations of a frame's cameras, beyond which they are no rig."""

@@ -15,8 +15,7 @@ from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Rows
 from jaxba.rotations import angle_axis
 from jaxba.typing import AnyArray
 
-AXES = np.array([1.0, -1.0, -1.0])
-"""From BAL's camera, which looks down -z with y up, to the axes of `Pose`."""
+AXES = np.array([1.0, -1.0, -1.0])  # from BAL's camera, which looks down -z with y up, to the axes of `Pose`
 
 
 class Pose(NamedTuple):

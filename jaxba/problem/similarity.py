@@ -13,11 +13,8 @@ from jaxba.problem.geometry import angle_axis, camera_poses, rotation_matrices
 Poses = Float[np.ndarray, "poses 3 4"]
 """Camera-to-world poses `[R | c]`."""
 
-LEAST_SPREAD = 1e-12
-"""Second singular value of the covariance over the first, below which positions lie on a line."""
-
-SAME_LINE = 1e-12
-"""Sine of the angle below which two unit vectors are taken to lie on one line."""
+LEAST_SPREAD = 1e-12  # second singular value of the covariance over the first, below which positions lie on a line
+SAME_LINE = 1e-12  # sine of the angle below which two unit vectors are taken to lie on one line
 
 
 class Similarity(NamedTuple):

@@ -57,24 +57,16 @@ DENSE_MATRICES = 4
 """Matrices of that size in memory for a dense factorisation: the system, a copy of its blocks, its transpose, its
 factor."""
 
-MAX_BYTES = 4e9
-"""Largest memory of a solver that `auto` may choose."""
+MAX_BYTES = 4e9  # largest memory of a solver that `auto` may choose
 
 BYTES_PER_OBSERVATION = 1100.0
 """Device memory of one implicit step in float64: arguments, results and temporaries; half of it in float32. Measured:
 1,072 on a scene of the size of Ladybug-1197."""
 
-BYTES_PER_PAIR = 16.0
-"""Index arrays with padding; the products are computed in batches."""
-
-MATRICES_PER_BLOCK = 3
-"""Numbers in memory per number of a block: its own, its partial sums and its sum."""
-
-MAX_COUNTED_PAIRS = 20_000_000
-"""Most pairs for which blocks are counted, which takes less than a second."""
-
-MAX_COUNTED_CAMERAS = 20_000
-"""Most cameras for which blocks are counted: the table takes a byte per pair of cameras."""
+BYTES_PER_PAIR = 16.0  # index arrays with padding; the products are computed in batches
+MATRICES_PER_BLOCK = 3  # numbers in memory per number of a block: its own, its partial sums and its sum
+MAX_COUNTED_PAIRS = 20_000_000  # most pairs for which blocks are counted, which takes less than a second
+MAX_COUNTED_CAMERAS = 20_000  # most cameras for which blocks are counted: the table takes a byte per pair of cameras
 
 
 class PairCounts(NamedTuple):

@@ -34,29 +34,17 @@ from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.solve import Solution, solution_of, solve
 from jaxba.structure.cells import NO_CELL, Sizes, cell_for, choose_cells
 
-BANK = 32
-"""Problems of a bank for each lane; on a CPU it has one lane, and half a second of work."""
-
-GPU_LANES = 256
-"""Lanes of a bank on a GPU."""
-
-SEEN = 512
-"""Most problems from whose sizes cells are chosen at a time."""
-
-SEEN_S = 0.5
-"""Longest time, in seconds, that is waited for them."""
+BANK = 32  # problems of a bank for each lane; on a CPU it has one lane, and half a second of work
+GPU_LANES = 256  # lanes of a bank on a GPU
+SEEN = 512  # most problems from whose sizes cells are chosen at a time
+SEEN_S = 0.5  # longest time, in seconds, that is waited for them
 
 WORTH = 16
 """Problems of a cell that pay for compiling its program; those of a smaller cell go to a larger one, if they fit."""
 
-ENDLESS = 10_000
-"""Problems that are expected of a stream of unknown length."""
-
-COMPILING_S = 0.1
-"""Seconds after which a thread that waits for a program looks for other work."""
-
-AHEAD = 4 * SEEN
-"""Most problems in memory."""
+ENDLESS = 10_000  # problems that are expected of a stream of unknown length
+COMPILING_S = 0.1  # seconds after which a thread that waits for a program looks for other work
+AHEAD = 4 * SEEN  # most problems in memory
 
 Result = Solution | Exception
 """What a problem ends with."""

@@ -19,14 +19,12 @@ from jaxba.solver.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.typing import InputError
 
-DTYPES = get_args(Dtype)
-"""Known floating point types; the first is the default."""
+DTYPES = get_args(Dtype)  # known floating point types; the first is the default
 
 Repairs = Literal["none", "trials", "all"]
 """What is done about a step that is not good enough: nothing; shorter steps; camera rounds and pattern moves, too."""
 
-INNER = "-inner"
-"""Suffix of a peer's mode with inner iterations, the peer's own embedded iterations."""
+INNER = "-inner"  # suffix of a peer's mode with inner iterations, the peer's own embedded iterations
 
 PEERS = {"pyceres": ("dense", "sparse", "iterative", f"dense{INNER}", f"sparse{INNER}")}
 """Peer libraries and their modes."""

@@ -23,8 +23,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.residual_slots import laid_out, with_block_values
 from jaxba.typing import AnyArray
 
-NO_CAMERAS = np.zeros(0, int)
-"""No cameras."""
+NO_CAMERAS = np.zeros(0, int)  # no cameras
 
 
 class Placed(NamedTuple):

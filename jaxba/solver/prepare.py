@@ -33,8 +33,7 @@ from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters
 from jaxba.typing import AnyArray, ArrayRecord
 
-DEFAULT_POLICY = GUARDED
-"""Name of the default damping policy."""
+DEFAULT_POLICY = GUARDED  # name of the default damping policy
 
 PADDED_CAMERAS, PADDED_OBSERVATIONS = 64, 60_000
 """Largest problem that is padded by default. Measured: iterations take 1.1 to 1.4 times as long up to there, but twice

@@ -9,8 +9,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from jaxba.solver.drivers import Callback, IterationRecord
 
 COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
-BEAT_S = 0.5
-"""Compilation is announced after so long, and has a dot for each of these."""
+BEAT_S = 0.5  # compilation is announced after so long, and has a dot for each of these
 
 
 def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Callable[[], AbstractContextManager]]:

@@ -43,8 +43,7 @@ _REST: Any = (_EVERYWHERE,) * 4
 _CARRY = Carry(LMState(*_STATE), *_REST)
 """Where the parts of a carry are: points are divided, all else is on every device."""
 
-MAX_ROUNDS = 8
-"""Most times that layouts are built until they agree; three or four suffice."""
+MAX_ROUNDS = 8  # most times that layouts are built until they agree; three or four suffice
 
 
 class Shards:

@@ -44,8 +44,7 @@ WORTH_S = 0.3
 """Seconds of quickly compiled iterations from which on better programs are compiled for later calls, which spares them
 three quarters of it."""
 
-NEVER = sys.maxsize
-"""Iterations before a step is fully optimised, if it never is."""
+NEVER = sys.maxsize  # iterations before a step is fully optimised, if it never is
 
 Call = Callable[..., Any]
 """Runs a program with these arguments, or compiles it for them."""
