@@ -26,8 +26,7 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.unknowns import Unknowns
 
-Solve = Callable[[Array], Array]
-"""A linear function of arrays [cameras, width] or [cameras, width, columns]."""
+Solve = Callable[[Array], Array]  # a linear function of arrays [cameras, width] or [cameras, width, columns]
 
 
 def bordered(

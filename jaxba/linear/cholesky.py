@@ -18,14 +18,9 @@ from jaxtyping import Float
 
 from jaxba.runtime import loops
 
-PANEL = 128
-"""Columns of a panel. Measured with 1350 unknowns: 11 ms with 128, 13 with 192, 16 with 256, 20 in one LAPACK call."""
-
-MAX_PANELS = 24
-"""Most panels. The loop over them is unrolled, so their number decides the size of the program."""
-
-MIN_UNKNOWNS = 512
-"""Smaller systems go to LAPACK: 441 unknowns were measured to take 1 ms either way."""
+PANEL = 128  # columns of a panel. With 1350 unknowns: 11 ms with 128, 13 with 192, 16 with 256, 20 in one LAPACK call
+MAX_PANELS = 24  # most panels. The loop over them is unrolled, so their number decides the size of the program.
+MIN_UNKNOWNS = 512  # smaller systems go to LAPACK: 441 unknowns were measured to take 1 ms either way
 
 
 class Panels(NamedTuple):

@@ -27,8 +27,7 @@ from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import DampedSystem, apply_reduced
 from jaxba.problem.options import StepOptions
 
-CORRECTION_FORCING = 1e-3
-"""Forcing term of the float64 conjugate gradients around a float32 factorisation; they take two or three products."""
+CORRECTION_FORCING = 1e-3  # forcing term of the float64 conjugate gradients around a float32 factorisation
 
 T = TypeVar("T")
 
@@ -49,8 +48,7 @@ def solve_reduced(system: DampedSystem, options: StepOptions) -> tuple[Float[Arr
     return _conjugate_gradients(corrected, lambda x: apply_reduced(system, x), precondition, options)
 
 
-_IN_SINGLE = ("linear", "points", "cameras", "parameters")
-"""What of a system is float32 in mixed precision."""
+_IN_SINGLE = ("linear", "points", "cameras", "parameters")  # what of a system is float32 in mixed precision
 
 
 def to_single(tree: T) -> T:

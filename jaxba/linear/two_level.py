@@ -36,15 +36,13 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 from jaxba.structure.sharing import Sharing
 
-SIMILARITY = 7
-"""Columns of a similarity; those of the numbers of lenses follow."""
+SIMILARITY = 7  # columns of a similarity; those of the numbers of lenses follow
 
 SHIFT = 64.0
 """Machine epsilons per coarse unknown added to the unit diagonal of the scaled coarse system, which is singular where a
 cluster has one camera: it has a column more than unknowns."""
 
-COARSE_PANEL = 256
-"""Columns of a panel of the coarse factor. With 1280 unknowns as fast as 128, a second less of compilation."""
+COARSE_PANEL = 256  # columns of a panel of the coarse factor: with 1280 unknowns as fast as 128, compiled sooner
 
 
 def camera_modes(

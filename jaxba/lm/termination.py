@@ -19,14 +19,9 @@ from jaxtyping import Bool, Float, Int
 from jaxba.lm.records import StepInfo
 from jaxba.refinement.acceptance import COST_ROUNDING
 
-DAMPING_LIMIT = 1e32
-"""A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
-
-MAX_UNDAMPED_RATIO = 100.0
-"""A small decrease or short step is convergence only if, undamped, it is at most so many times as large."""
-
-FRACTION_ROUNDING = 64.0
-"""Machine epsilons within which a damping fraction is one: with lambda = 1e30 it was computed just below."""
+DAMPING_LIMIT = 1e32  # a step rejected with such a lambda ends the solve. Source: Ceres, min_trust_region_radius
+MAX_UNDAMPED_RATIO = 100.0  # a small decrease or short step is convergence if, undamped, at most so many times as large
+FRACTION_ROUNDING = 64.0  # machine epsilons within which a damping fraction is one: for 1e30 it was just below
 
 
 LEFT_BY_DAMPING, LEAST_LEFT, MOST_LEFT = 3000.0, 0.01, 300.0

@@ -38,8 +38,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, take_each, take_rows, tree_sum
 
-MIN_CONSENSUS_DAMPING = 1.0
-"""Smallest lambda for which gradients of replicas agree. Source: the authors' code (radius at most 1)."""
+MIN_CONSENSUS_DAMPING = 1.0  # smallest lambda for which gradients of replicas agree. Source: the authors' code
 
 
 SplitSystem: TypeAlias = tuple[list[list[Array]], list[Array]]

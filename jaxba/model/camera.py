@@ -31,8 +31,7 @@ from jaxba.structure.segment_sums import take, take_each
 from jaxba.structure.unknowns import BAL_UNKNOWNS, Unknowns
 from jaxba.typing import AnyArray
 
-EVERYWHERE = np.array(True)
-"""A mask that masks nothing; XLA removes it."""
+EVERYWHERE = np.array(True)  # a mask that masks nothing; XLA removes it
 
 
 class Frames(NamedTuple):

@@ -29,20 +29,15 @@ from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
 
-NEGLIGIBLE = 1e-6
-"""Relative predicted decrease below which there are no camera rounds or further trials. Source: Ceres."""
+NEGLIGIBLE = 1e-6  # relative predicted decrease below which are no camera rounds or further trials. Source: Ceres
 
 POINT_DECREASE = 1e-2
 """Candidates after the full step stop their point iterations once one lowers the cost by less than this fraction of the
 predicted decrease. Not the full step: with the same rule there, `ceres+refine3` took 34 instead of 22 iterations to a
 relative error of 1e-3 on kitti00vo."""
 
-NEAR_CONVERGENCE = 1e-3
-"""Predicted decrease, relative to the cost, below which points are refined from both of their starts, which doubles the
-time. Measured: in earlier iterations it brings nothing more."""
-
-COST_ROUNDING = 8.0
-"""Relative rounding error of a cost in machine epsilons: 1e-6 in float32, measured, and 2e-15 in float64."""
+NEAR_CONVERGENCE = 1e-3  # predicted decrease, relative to the cost, below which both starts of points are refined
+COST_ROUNDING = 8.0  # relative rounding error of a cost in machine epsilons: 1e-6 in float32, 2e-15 in float64
 
 
 class Step(NamedTuple):

@@ -35,11 +35,8 @@ from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.retraction import keep_focal_signs, move_cameras, step_between
 from jaxba.runtime import loops
 
-SHORTER = 0.25
-"""Factor on the length of a rejected step. Measured with 4 trials on Ladybug-49 with a constant lambda of 1e-6."""
-
-GOOD_GAIN = 0.5
-"""Gain ratio from which the linear model is trusted and there are no camera rounds."""
+SHORTER = 0.25  # factor on the length of a rejected step. Measured with 4 trials on Ladybug-49, lambda 1e-6
+GOOD_GAIN = 0.5  # gain ratio from which the linear model is trusted and there are no camera rounds
 
 MAX_COST_RATIO = 1.5
 """Largest cost of a candidate, relative to the cost before the step, for camera rounds: outliers would pull cameras
@@ -54,8 +51,7 @@ ROUNDS_OF_LATER_CANDIDATES = 1
 for such steps: 6.40 iterations to within 1e-4 of the best cost with none for backtracked candidates, 6.02 with one,
 5.88 with three; on real problems three took a tenth more work than one."""
 
-GAIN_TOLERANCE = 0.25
-"""Difference of the gain ratio from one up to which the linear model predicted the step."""
+GAIN_TOLERANCE = 0.25  # difference of the gain ratio from one up to which the linear model predicted the step
 
 SMALL_DAMPING_FRACTION = 0.1
 """Damping fraction `d.D d / d.(H + D) d` up to which damping did not limit the length of a step. If the linear model

@@ -24,11 +24,8 @@ from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
-UNDISTORTIONS = 10
-"""Iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge."""
-
-FEW_UNDISTORTIONS = 3
-"""The same within an iteration of the solver, where it is done for every candidate."""
+UNDISTORTIONS = 10  # iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge.
+FEW_UNDISTORTIONS = 3  # the same within an iteration of the solver, where it is done for every candidate
 
 
 def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDISTORTIONS) -> Float[Array, "3 points"]:

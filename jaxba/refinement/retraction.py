@@ -22,9 +22,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.rotations import left_jacobian
 from jaxba.structure.layout import Layout
 
-MAX_FOCAL_CHANGE = 0.3
-"""Relative change of a focal length beyond which k1 and k2 are added as they are: the fourth power of a first-order
-step is meaningless there. Measured: less gain with 0.1; no difference without a limit."""
+MAX_FOCAL_CHANGE = 0.3  # relative change of f beyond which k1, k2 are added as they are. With 0.1 less gain
 
 
 def move_cameras(

@@ -43,8 +43,7 @@ BREAK_EVEN: dict[Kind, int] = {"factorization": 1_200_000, "iterative": 1_000_00
 """Observations times iterations after which better programs have paid for their compilation, as
 `benchmarks.compilation` measures it. Those of a step are compiled side by side, and so take as long as the first."""
 
-TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}
-"""Iterations that a solve may well take: quick programs that would not last so long are left out."""
+TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}  # iterations that a solve may well take
 
 
 def quick_iterations(kind: Kind, observations: int) -> int:

@@ -18,15 +18,9 @@ from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
-PAIR_CHUNKS = (4, 8)
-"""Candidate chunk widths: pairs of one block that are multiplied and summed together."""
-
-PAIR_BATCH = 2048
-"""Most chunks per batch. It bounds the gathered operands to 7 MB and the products to 1.3 MB, so that they stay in the
-cache."""
-
-PAIR_ITEM_COST = 1.5
-"""Cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width."""
+PAIR_CHUNKS = (4, 8)  # candidate chunk widths: pairs of one block that are multiplied and summed together
+PAIR_BATCH = 2048  # most chunks per batch: gathered operands of 7 MB and products of 1.3 MB stay in the cache
+PAIR_ITEM_COST = 1.5  # cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width
 
 
 @register_pytree
@@ -34,11 +28,8 @@ PAIR_ITEM_COST = 1.5
 class PairLayout:
     """The pairs of observations of each block of the reduced camera system, lower triangle."""
 
-    left: Int[AnyArray, "batches chunks width"]
-    """Camera-sorted index of the observation by the camera of the block's rows."""
-
-    right: Int[AnyArray, "batches chunks width"]
-    """Camera-sorted index of the observation of the same point by the camera of the block's columns."""
+    left: Int[AnyArray, "batches chunks width"]  # camera-sorted index of the observation by the camera of the rows
+    right: Int[AnyArray, "batches chunks width"]  # the same of the same point by the camera of the block's columns
 
     sums: Int[AnyArray, "batches partial width_of_sums"]
     """Chunks of a batch that belong to one block and are summed together. The last row of a batch is padding."""
@@ -48,29 +39,20 @@ class PairLayout:
     instead the ranks of partial sums that are added (`sum_trees.prefix_levels`), and blocks are sorted by their number
     of partial sums."""
 
-    used: Int[AnyArray, ""] | None
-    """Number of batches that hold pairs, with fixed capacity; None for all."""
-
-    block_camera: Int[AnyArray, " blocks"]
-    """Camera of each diagonal block; the number of cameras for other blocks."""
-
-    block_row: Int[AnyArray, " blocks"]
-    """Camera of the rows of each block."""
-
-    block_column: Int[AnyArray, " blocks"]
-    """Camera of the columns of each block."""
+    used: Int[AnyArray, ""] | None  # number of batches that hold pairs, with fixed capacity; None for all
+    block_camera: Int[AnyArray, " blocks"]  # camera of each diagonal block; the number of cameras for other blocks
+    block_row: Int[AnyArray, " blocks"]  # camera of the rows of each block
+    block_column: Int[AnyArray, " blocks"]  # camera of the columns of each block
 
     product_levels: tuple[Int[AnyArray, "_ _"], ...]
     """Summation tree to cameras of `S x`: from the products of blocks, followed by those of transposed blocks."""
 
-    diagonal: Int[AnyArray, " cameras"]
-    """Index of the diagonal block of each camera."""
+    diagonal: Int[AnyArray, " cameras"]  # index of the diagonal block of each camera
 
     table: Int[AnyArray, "cameras cameras"] | None
     """Index of the block of (row, column) in the lower triangle, else of the zero block; for a dense factorisation."""
 
-    band: Band | None
-    """For a band factorisation instead; None if the system is not factored as a band."""
+    band: Band | None  # for a band factorisation instead; None if the system is not factored as a band
 
 
 def pair_layout(

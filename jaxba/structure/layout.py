@@ -47,8 +47,7 @@ from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-CAMERA_CHUNK = 8
-"""Observations per chunk of a camera. Their products are unrolled, so this number decides the size of the program."""
+CAMERA_CHUNK = 8  # observations per chunk of a camera. Their products are unrolled: it decides the program's size
 
 
 @register_pytree

@@ -20,11 +20,8 @@ from scipy.sparse import csr_matrix
 
 from jaxba.structure.agglomeration import shared_points
 
-TEMPERATURE = 10.0
-"""Inverse temperature of the softmax; larger is greedier. Source: the authors' code."""
-
-MAX_PASSES = 30
-"""Most passes of one clustering. Each about halves the number of communities; 5 to 8 are usual."""
+TEMPERATURE = 10.0  # inverse temperature of the softmax; larger is greedier. Source: the authors' code.
+MAX_PASSES = 30  # most passes of one clustering. Each about halves the number of communities; 5 to 8 are usual.
 
 
 def camera_graph(

@@ -27,12 +27,8 @@ CAMERAS = (8, 12, 16, 20, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128)
 """Sizes in cameras. A dense system of 128 cameras, 1152 unknowns, takes 8 ms to factor; longer sequences are better
 factored as bands."""
 
-POINT_CHUNK = 2
-"""Slots per chunk: each point has as many chunks as its observations need. Measured on five real problems: 6 to 14% of
-the slots of such chunks are empty; with three it is 11 to 28%."""
-
-MIN_OBSERVATIONS = 1024
-"""Smallest number of slots. Measured on Ladybug-49: a step takes 0.2 us per slot, so that this many cost no time."""
+POINT_CHUNK = 2  # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
+MIN_OBSERVATIONS = 1024  # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
 
 POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)
 """Points per chunk in the capacity, as few as suffice. Real problems have 0.2 to 0.6, and every point has a chunk. A
@@ -42,14 +38,9 @@ PAIRS_PER_SLOT = 6
 """Pairs per slot in the capacity, or 2, 4, ... times as many. Windows of the KITTI sequence kitti00vo have 2.9 to 4.2.
 Only those batches of pairs are multiplied that hold some, so that spare pairs cost little."""
 
-MAX_CAMERAS = CAMERAS[-1]
-"""Most cameras of a padded problem."""
-
-MAX_OBSERVATIONS = 1 << 17
-"""Most slots of a padded problem. Measured on Ladybug-49: a step takes 0.4 us per slot, twenty steps take a second."""
-
-MAX_PAIRS = 1 << 20
-"""Most pairs of a padded problem. Measured: a step takes 0.1 us per pair, twenty steps take two seconds."""
+MAX_CAMERAS = CAMERAS[-1]  # most cameras of a padded problem
+MAX_OBSERVATIONS = 1 << 17  # most slots of a padded problem. On Ladybug-49 a step takes 0.4 us per slot
+MAX_PAIRS = 1 << 20  # most pairs of a padded problem. Measured: 0.1 us per pair and step, twenty steps take two seconds
 
 
 @dataclass(frozen=True)
@@ -58,11 +49,8 @@ class Capacity:
 
     cameras: int
     points: int
-    observations: int
-    """Number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty."""
-
-    pairs: int
-    """Number of pairs of observations of one point, an observation with itself included."""
+    observations: int  # number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty
+    pairs: int  # number of pairs of observations of one point, an observation with itself included
 
     fixed: bool = False
     """Whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a

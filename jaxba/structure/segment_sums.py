@@ -105,8 +105,7 @@ def _level_sum(rows: Array, level: Array) -> Array:
     return jnp.sum(take_rows(rows, level), axis=1)
 
 
-UNROLLED_RANKS = 4
-"""Ranks of a level up to which each is gathered by itself. More of them are few rows each, and take long to compile."""
+UNROLLED_RANKS = 4  # ranks of a level up to which each is gathered by itself. More take long to compile.
 
 
 def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "_ _"], ...], axis: int) -> Array:

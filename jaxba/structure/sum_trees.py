@@ -13,21 +13,15 @@ from jaxtyping import Int
 
 from jaxba.structure.agreement import ALONE, Agreement
 
-TREE_WIDTH = 8
-"""Width of the chunks on all levels but the first."""
+TREE_WIDTH = 8  # width of the chunks on all levels but the first
 
 
 class Room(NamedTuple):
     """Upper bounds from which the shapes of a tree follow, so that they do not depend on the data."""
 
-    items: int
-    """Largest number of items of all targets together."""
-
-    most: int
-    """Largest number of items of one target."""
-
-    exact: bool = False
-    """Whether these are the numbers of the data themselves, so that shapes depend on them."""
+    items: int  # largest number of items of all targets together
+    most: int  # largest number of items of one target
+    exact: bool = False  # whether these are the numbers of the data themselves, so that shapes depend on them
 
     @classmethod
     def of(cls, counts: Int[np.ndarray, " targets"]) -> Room:
