@@ -37,11 +37,7 @@ from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 from jaxba.structure.sharing import Sharing
 
 SIMILARITY = 7  # columns of a similarity; those of the numbers of lenses follow
-
-SHIFT = 64.0
-"""Machine epsilons per coarse unknown added to the unit diagonal of the scaled coarse system, which is singular where a
-cluster has one camera: it has a column more than unknowns."""
-
+SHIFT = 64.0  # machine epsilons per unknown added to the diagonal, singular for clusters of one camera
 COARSE_PANEL = 256  # columns of a panel of the coarse factor: with 1280 unknowns as fast as 128, compiled sooner
 
 

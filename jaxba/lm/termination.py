@@ -23,7 +23,6 @@ DAMPING_LIMIT = 1e32  # a step rejected with such a lambda ends the solve. Sourc
 MAX_UNDAMPED_RATIO = 100.0  # a small decrease or short step is convergence if, undamped, at most so many times as large
 FRACTION_ROUNDING = 64.0  # machine epsilons within which a damping fraction is one: for 1e30 it was just below
 
-
 LEFT_BY_DAMPING, LEAST_LEFT, MOST_LEFT = 3000.0, 0.01, 300.0
 """What is left after a step, in units of its decrease, is at most the first number times the damping fraction, between
 the other two. Of the default's steps on half of 200 real and random problems, these hold the distance to the end in 95

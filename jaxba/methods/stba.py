@@ -40,7 +40,6 @@ from jaxba.structure.segment_sums import point_sum, take, take_each, take_rows, 
 
 MIN_CONSENSUS_DAMPING = 1.0  # smallest lambda for which gradients of replicas agree. Source: the authors' code
 
-
 SplitSystem: TypeAlias = tuple[list[list[Array]], list[Array]]
 """The eliminated point replicas (linear/schur.py), of each slot's replica: Q = J_p L^-T, [2][3] of (slots,), and
 h = L^-1 g, [3] of (slots,)."""
@@ -50,11 +49,8 @@ h = L^-1 g, [3] of (slots,)."""
 class StochasticClusters(StepMethod):
     """The method `stba`."""
 
-    cluster_cameras: int = 100
-    """Largest number of cameras in a cluster. Source: the authors' code."""
-
-    repairs: int = 4
-    """Richardson iterations on the true system after the clusters' solution. Source: the authors' code."""
+    cluster_cameras: int = 100  # largest number of cameras in a cluster. Source: the authors' code
+    repairs: int = 4  # Richardson iterations on the true system after the clusters' solution. Source: the authors' code
 
     name = "stba"
     rule = "stba"

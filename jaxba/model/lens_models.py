@@ -17,9 +17,7 @@ from jaxba.typing import AnyArray
 Pair = tuple[Array, Array]
 
 Which = tuple[Int[Array, "..."], ...]  # position of each camera's model, if there are several
-
-Rows = tuple[list[list[Array]], Callable[[int], Pair]]
-"""`dz/dP`, [2][3], and `dz/d number k of the lens` as a function of k."""
+Rows = tuple[list[list[Array]], Callable[[int], Pair]]  # `dz/dP`, [2][3], and `dz/d number k of the lens`
 
 
 class Projection(NamedTuple):

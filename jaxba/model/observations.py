@@ -41,8 +41,7 @@ class Views(NamedTuple):
         return list(fusion_barrier(jnp.stack(rows))) if fast_compilation.value else rows
 
 
-Terms = Callable[..., list[Array]]
-"""A function of `Views` and of further vectors over the same slots; it returns a list of vectors."""
+Terms = Callable[..., list[Array]]  # of `Views` and further vectors over the same slots
 
 
 def view_terms(

@@ -17,11 +17,7 @@ Status = Literal["reproduced", "partly", "not", "not run"]
 
 RATIO_TOLERANCE = 1.25  # a ratio is reproduced if ours is the paper's up to this factor, either way
 PARTLY_RATIO = 0.9  # a ratio is partly reproduced if ours is at most this, a gain of at least a tenth, of another size
-
-FRACTION_TOLERANCE = 0.05
-"""A fraction is reproduced if ours differs from the paper's by at most this. Also the largest deficit in success of a
-method whose iterations or seconds are compared."""
-
+FRACTION_TOLERANCE = 0.05  # up to which fractions are alike; a larger deficit in success makes a gain none
 PARTLY_FRACTION_TOLERANCE = 0.15  # a fraction is partly reproduced if ours differs from the paper's by at most this
 
 

@@ -26,10 +26,7 @@ T = TypeVar("T")
 SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
 
 NEAR = 1e-3  # relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost
-
-GOOD_END = 1e-2
-"""Relative tolerance of `Row.good_ends`: the final cost is within this of the best known cost. A solver that converges
-to a worse cost needs few iterations without being better."""
+GOOD_END = 1e-2  # relative tolerance of `Row.good_ends`: a solver that ends higher needs few iterations
 
 
 @dataclass(frozen=True)

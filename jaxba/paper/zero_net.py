@@ -36,9 +36,7 @@ from jaxba.runtime.jit import jit
 from jaxba.training import checkpoint
 from jaxba.typing import register_pytree
 
-MAX_SLOPE = 1.0
-"""Limit of the derivative of log10(cost) with respect to the action for each scene, so that one diverging step does not
-dominate a batch. A step with a non-finite cost counts as this limit, towards a larger lambda."""
+MAX_SLOPE = 1.0  # of log10(cost) by the action, for each scene; that of a step of non-finite cost is its negative
 
 _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
 

@@ -18,7 +18,6 @@ Options = dict[str, bool | int | str]
 
 RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}  # of all programs on a CPU: no fusions for YNNPACK
 
-
 QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 """XLA's options for hardly optimised programs, as far as a jaxlib knows them: 0.12 has no older emitters."""
 

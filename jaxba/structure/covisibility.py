@@ -30,28 +30,21 @@ class PairLayout:
 
     left: Int[AnyArray, "batches chunks width"]  # camera-sorted index of the observation by the camera of the rows
     right: Int[AnyArray, "batches chunks width"]  # the same of the same point by the camera of the block's columns
-
+    # chunks of a batch that belong to one block and are summed together. The last row of a batch is padding.
     sums: Int[AnyArray, "batches partial width_of_sums"]
-    """Chunks of a batch that belong to one block and are summed together. The last row of a batch is padding."""
-
+    # summation tree from the partial sums of all batches to blocks; the last block is always zero. With fixed capacity
+    # instead the ranks of partial sums that are added (`sum_trees.prefix_levels`), and blocks are sorted by their
+    # number of partial sums.
     levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree from the partial sums of all batches to blocks; the last block is always zero. With fixed capacity
-    instead the ranks of partial sums that are added (`sum_trees.prefix_levels`), and blocks are sorted by their number
-    of partial sums."""
-
     used: Int[AnyArray, ""] | None  # number of batches that hold pairs, with fixed capacity; None for all
     block_camera: Int[AnyArray, " blocks"]  # camera of each diagonal block; the number of cameras for other blocks
     block_row: Int[AnyArray, " blocks"]  # camera of the rows of each block
     block_column: Int[AnyArray, " blocks"]  # camera of the columns of each block
-
+    # summation tree to cameras of `S x`: from the products of blocks, followed by those of transposed blocks
     product_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree to cameras of `S x`: from the products of blocks, followed by those of transposed blocks."""
-
     diagonal: Int[AnyArray, " cameras"]  # index of the diagonal block of each camera
-
+    # index of the block of (row, column) in the lower triangle, else of the zero block; for a dense factorisation
     table: Int[AnyArray, "cameras cameras"] | None
-    """Index of the block of (row, column) in the lower triangle, else of the zero block; for a dense factorisation."""
-
     band: Band | None  # for a band factorisation instead; None if the system is not factored as a band
 
 

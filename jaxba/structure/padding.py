@@ -29,10 +29,7 @@ factored as bands."""
 
 POINT_CHUNK = 2  # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
 MIN_OBSERVATIONS = 1024  # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
-
-POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)
-"""Points per chunk in the capacity, as few as suffice. Real problems have 0.2 to 0.6, and every point has a chunk. A
-padding point without slots costs little."""
+POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)  # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
 
 PAIRS_PER_SLOT = 6
 """Pairs per slot in the capacity, or 2, 4, ... times as many. Windows of the KITTI sequence kitti00vo have 2.9 to 4.2.
@@ -51,10 +48,9 @@ class Capacity:
     points: int
     observations: int  # number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty
     pairs: int  # number of pairs of observations of one point, an observation with itself included
-
+    # whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a point
+    # twice. Else they are smaller where the problem is a usual one.
     fixed: bool = False
-    """Whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a
-    point twice. Else they are smaller where the problem is a usual one."""
 
     def holds(self, observations: ObservationOrder) -> bool:
         """Whether the problem fits; its pairs are not counted."""

@@ -36,11 +36,9 @@ class Partition:
 
     label: Int[AnyArray, "*t cameras"]  # cluster of each camera
     members: Int[AnyArray, "*t clusters size"]  # cameras of each cluster, in order; padded with the number of cameras
-
+    # index in `PairLayout` of the block of two members, lower triangle; else that of the zero block, and one past it on
+    # the diagonal of the padding
     blocks: Int[AnyArray, "*t clusters size size"]
-    """Index in `PairLayout` of the block of two members, lower triangle; else that of the zero block, and one past it
-    on the diagonal of the padding."""
-
     slot_replica: Int[AnyArray, "*t slots"]  # point replica of each slot; the last, without observations, of empty ones
     levels: tuple[Int[AnyArray, "*t _ _"], ...]  # summation tree from slots to point replicas
 

@@ -39,14 +39,12 @@ class ResidualSlots(ArrayRecord):
     rows: Rows  # the function and its data
     cameras: tuple[Int[AnyArray, " rows"], ...]  # one or two cameras of each row
     points: tuple[Int[AnyArray, " rows"], ...]  # one or two points of each row, in layout order; any if it takes none
-
+    # slots of each row: of each pair of numbers, and each of its one or two cameras or points; out of range where there
+    # is none
     slots: Int[AnyArray, "pairs ends rows"]
-    """Slots of each row: of each pair of numbers, and each of its one or two cameras or points; out of range where
-    there is none."""
-
+    # for each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
+    # is no block
     places: tuple[tuple[int, int], ...] = field(metadata={"static": True})
-    """For each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
-    is no block."""
 
 
 def laid_out(problem: BundleProblem) -> BundleProblem:

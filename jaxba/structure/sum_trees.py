@@ -79,13 +79,11 @@ def sum_tree(
         most, width = -(-most // width), TREE_WIDTH
 
 
-PREFIX_SHARES = (
+PREFIX_SHARES = (  # most targets that have an item of a rank, relative to all items; the last suffices always
     lambda rank: min(1 / (2 * rank + 2), 1 / rank**2) if rank > 1 else 1 / (rank + 1),
     lambda rank: 1 / (2 * rank + 2) if rank > 1 else 1 / (rank + 1),
     lambda rank: 1 / (rank + 1),
 )
-"""Targets that have an item of a rank, relative to all items: at most what the last of these functions says. On real
-problems the first one suffices, or the second where tracks are long."""
 
 
 def prefix_levels(

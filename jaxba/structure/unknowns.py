@@ -50,10 +50,8 @@ class Unknowns(ArrayRecord):
     model: Int[AnyArray, " cameras"]  # camera model of each camera, a position in `models`
     models: tuple[CameraModel, ...] = field(metadata={"static": True})  # camera models
     all_shared: bool = field(metadata={"static": True})  # whether every observed camera shares a lens with others
-
+    # numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block, ascending
     columns: tuple[int, ...] = field(metadata={"static": True})
-    """Numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block, ascending."""
-
     lens_size: int = field(metadata={"static": True})  # number of all intrinsics of a camera
     own_sizes: tuple[int, ...] = field(metadata={"static": True})  # numbers of these blocks, the last ones of a camera
     in_rigs: bool = field(metadata={"static": True})  # whether poses are those of frames, extrinsics the last numbers

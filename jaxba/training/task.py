@@ -34,7 +34,7 @@ RULES = "rules.npz"
 EMBEDDED = "+embedded"  # ending of the name of a rule that has the embedded iterations of the agent's step
 CONSTANT = "constant action"  # name of the best constant action on training scenes
 
-BASELINES = (
+BASELINES = (  # rules without the ending have plain steps; `bold` the game's guard; `guarded`, `learned` their own
     "ceres",
     "classic",
     "gtsam",
@@ -47,13 +47,9 @@ BASELINES = (
     LEARNED,
     CONSTANT,
 )
-"""What a trained policy is compared with. Without the ending, rules have plain steps of the method. `bold` is the
-smallest lambda that the game's own guard allows, with the agent's step. `guarded` and `learned` are what ships, with
-their own steps and guards."""
 
 TRAINED = "trained"  # name of the trained policy in tables
 WEIGHTLESS = "its weights zero"  # name of the trained policy without its weights (`without_weights`)
-
 
 Comparison: TypeAlias = tuple[dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]]
 """Trained policies on the held-out scenes: scores by name (of every agent if there are several, of all agents and of
