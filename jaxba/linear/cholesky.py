@@ -100,8 +100,7 @@ def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Pane
 def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
 
-    Not by LAPACK: batched calls in nested loops deadlocked on a CPU (jax 0.10.2, two threads, 64 scenes).
-    """
+    Not by LAPACK: batched calls in nested loops deadlocked on a CPU (jax 0.10.2, two threads, 64 scenes)."""
 
     def eliminate(k: Array, table: Array) -> Array:
         row = table[:, k] / table[:, k, k, None]

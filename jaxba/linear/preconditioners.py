@@ -68,8 +68,7 @@ def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]
 
     With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
     observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the
-    two observations is missing, which is harmless in a preconditioner.
-    """
+    two observations is missing, which is harmless in a preconditioner."""
     layout, (over, under) = system.layout, system.points.projected
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     f00 = safe_sqrt(jnp.maximum(1 - dot(over, over), 0))

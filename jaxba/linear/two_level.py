@@ -47,8 +47,7 @@ def camera_modes(
     """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for unseen cameras.
 
     For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all projections is
-    `-R a` for the rotation and `-R b + s t` for the translation.
-    """
+    `-R a` for the rotation and `-R b + s t` for the translation."""
     minus_rotation = -jnp.moveaxis(rotation_matrix(cameras[:3]), -1, 0)
     count = minus_rotation.shape[0]
     numbers = width - POSE_SIZE

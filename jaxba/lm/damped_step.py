@@ -89,8 +89,7 @@ def _slope_and_damping(
 
         m(0) - m(d) = -g.d - d.H d / 2 = (d.D d - g.d + d.e) / 2.
 
-    `d.e` is zero for a factorisation, and for conjugate gradients from zero. The other two terms are positive.
-    """
+    `d.e` is zero for a factorisation, and for conjugate gradients from zero. The other two terms are positive."""
     points, cameras = system.points, system.cameras
     of_points = jnp.sum(jnp.stack(points.gradient) * point_step), jnp.sum(jnp.stack(points.damping) * point_step**2)
     slope, damped = sum_over_devices(system.layout, of_points)

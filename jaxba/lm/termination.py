@@ -77,8 +77,7 @@ _REASONS = {
 class Tolerances(NamedTuple):
     """Tolerances of the convergence tests, and a target cost. The defaults are those of Ceres.
 
-    `ftol` and `xtol` apply to accepted steps. Rejected steps end a solve by `lost_in_rounding`.
-    """
+    `ftol` and `xtol` apply to accepted steps. Rejected steps end a solve by `lost_in_rounding`."""
 
     ftol: float = 1e-6
     """An accepted step with `f - f_new <= ftol f` that damping did not make short (`converged_in_cost`)."""
@@ -102,8 +101,7 @@ def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:
 
     What is left to do after a step is what damping kept it from doing. Where damping has no share of it (the fraction
     is zero), next steps decrease the cost by far less than this one; in a flat valley, where it has, by as much for
-    many times. `where` is NumPy's for records of NumPy arrays.
-    """
+    many times. `where` is NumPy's for records of NumPy arrays."""
     decrease, share = (step.previous_cost - step.cost) / step.cost, step.damping_fraction
     # of one direction the undamped model predicts s^2 / (1 - s^2) times the decrease (`converged_in_cost`)
     left = decrease * (LEFT_BY_DAMPING * share).clip(LEAST_LEFT, MOST_LEFT) / (1 - share**2)
@@ -115,8 +113,7 @@ def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
 
     Let `s = d.D d / d.(H + D) d` be the damping fraction. Along a direction of curvature h it is
     `s = lambda / (h + lambda)`, and the undamped model predicts `1 / (1 - s^2)` times the decrease.
-    This estimate may be at most `MAX_UNDAMPED_RATIO` times the tolerance.
-    """
+    This estimate may be at most `MAX_UNDAMPED_RATIO` times the tolerance."""
     return step.accepted & _is_negligible(step.previous_cost - step.cost, step, ftol)
 
 
@@ -124,8 +121,7 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
     """Whether a step was rejected whose predicted decrease is below the rounding error of the cost.
 
     Such a rejection says nothing about the step, and the next steps, damped more, predict even less. In float64 this is
-    far below useful tolerances. In float32 it happens before `ftol` is met.
-    """
+    far below useful tolerances. In float32 it happens before `ftol` is met."""
     rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
     known = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not report rejected steps (peers/driven.py)
     return ~step.accepted & known & _is_negligible(step.predicted, step, rounding)

@@ -47,8 +47,7 @@ class Frames(NamedTuple):
     def at(self, index: Int[AnyArray, " n"]) -> Frames:
         """The frames of the cameras in `index`.
 
-        Computed once per camera: a fusion barrier keeps XLA from computing rotations again for every index.
-        """
+        Computed once per camera: a fusion barrier keeps XLA from computing rotations again for every index."""
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
         rows = [row for place in self.places for row in place]
         table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens, *rows]))

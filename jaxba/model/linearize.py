@@ -38,8 +38,7 @@ class Linearization(NamedTuple):
     """Whitened and weighted residuals and Jacobians; everything is zero in empty slots.
 
     Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians), translation, then the numbers
-    of the lens that are unknown (structure/unknowns.py): f, k1 and k2 of BAL.
-    """
+    of the lens that are unknown (structure/unknowns.py): f, k1 and k2 of BAL."""
 
     residual: list[Array]  # [2] of (slots,), pixels
     camera_jacobian: list[list[Array]]  # [2][width] of (slots,)

@@ -31,8 +31,7 @@ class Views(NamedTuple):
     def projected(self) -> camera.Projection:
         """The projections of the points.
 
-        Materialised under fast compilation, where each vector computed from them has a loop of its own.
-        """
+        Materialised under fast compilation, where each vector computed from them has a loop of its own."""
         projection = camera.project(self.frames, self.points, self.mask)
         return projection.stacked() if fast_compilation.value else projection
 

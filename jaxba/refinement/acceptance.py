@@ -55,8 +55,7 @@ class Step(NamedTuple):
         """Decrease of the cost that the linear model predicts for `fraction * d`, pixels^2.
 
         `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not negative, so that
-        nothing cancels.
-        """
+        nothing cancels."""
         return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
 
 

@@ -67,8 +67,7 @@ class Search(NamedTuple):
 def best_candidate(against: Comparison) -> Candidate:
     """Evaluates a step: the candidate of the iteration, with the accept decision.
 
-    It is the first accepted candidate, possibly extended by pattern moves, or the last rejected one.
-    """
+    It is the first accepted candidate, possibly extended by pattern moves, or the last rejected one."""
     options = against.options
     start = first_search(against.cameras, against.previous.points, against.cost, against.step)
     start = jax.tree.map(jnp.asarray, start)

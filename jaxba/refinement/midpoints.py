@@ -72,8 +72,7 @@ def choose_starts(
     First the one of lower cost, or that has not diverged; then the other one, or the same if there is none.
 
     If the linear model sends a point behind its cameras, or so far away that its gradient vanishes, its own steps do
-    not bring it back; the midpoint of its rays does, unless it diverged itself (`PreviousPoints`).
-    """
+    not bring it back; the midpoint of its rays does, unless it diverged itself (`PreviousPoints`)."""
     middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
 
     def terms(views: Views, front: Array, *other: Array) -> list[Array]:

@@ -178,6 +178,5 @@ def has_receded(inverse_depth_sum: Float[Array, " points"], before: Float[Array,
     """Whether points have moved behind their cameras or more than `MAX_DISTANCE_RATIO` times as far away.
 
     Both arguments are sums of inverse depths over a point's cameras, negative in front of them. A point that was behind
-    its cameras before has not receded, wherever it is.
-    """
+    its cameras before has not receded, wherever it is."""
     return (before < 0) & (MAX_DISTANCE_RATIO * inverse_depth_sum > before)

@@ -56,8 +56,7 @@ def keep_focal_signs(
     """Whether the focal length of each camera keeps its sign; false where it becomes zero.
 
     A mirrored image can fit for a while, and the iterations do not lead back; no file of cameras may hold one. A camera
-    that had no focal length may get any, and numbers that are not finite pass, since their cost is none.
-    """
+    that had no focal length may get any, and numbers that are not finite pass, since their cost is none."""
     return ~(jnp.sign(before[6]) * jnp.sign(after[6]) <= 0) | (before[6] == 0)
 
 

@@ -49,8 +49,7 @@ def reverse_cuthill_mckee(linked: Bool[np.ndarray, "nodes nodes"]) -> Int[np.nda
     """The nodes of a symmetric graph in the reverse Cuthill-McKee ordering.
 
     A breadth-first search from a node of least degree, which takes the new neighbours of a node by increasing degree;
-    reversed. The same order as SciPy's, whose import takes longer than this for a thousand cameras.
-    """
+    reversed. The same order as SciPy's, whose import takes longer than this for a thousand cameras."""
     degree = (linked.sum(axis=1) + linked.diagonal()).astype(np.int32)
     order, found, waiting = np.empty(len(linked), np.int64), 0, np.ones(len(linked), bool)
     for seed in np.argsort(degree):

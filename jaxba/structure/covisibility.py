@@ -255,8 +255,7 @@ def _sorted_by_block(
 ) -> tuple[Int[np.ndarray, " blocks"], Int[np.ndarray, " blocks"], Int[np.ndarray, " pairs"]]:
     """Keys `row * cameras + column` of non-zero blocks, sorted, their numbers of pairs, and pairs sorted by block.
 
-    Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable.
-    """
+    Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable."""
     listed = np.append(listed, np.arange(cameras, dtype=np.int64) * (cameras + 1))
     pair_keys = rows.astype(np.int64) * cameras + columns
     order = sorted_by(pair_keys, cameras**2)

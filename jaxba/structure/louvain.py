@@ -29,8 +29,7 @@ def camera_graph(
 ) -> csr_matrix:
     """Edge weights `|P_i and P_j| / |P_i or P_j|` for the sets P_i of points that camera i sees, [cameras, cameras].
 
-    For a large problem they are estimated from a sample of the points (`agglomeration.shared_points`).
-    """
+    For a large problem they are estimated from a sample of the points (`agglomeration.shared_points`)."""
     shared, seen = shared_points(camera, point, cameras, points)
     edges = shared.tocoo()
     weight = edges.data / (seen[edges.row] + seen[edges.col] - edges.data)
@@ -94,8 +93,7 @@ def _pass(
 ) -> np.ndarray:
     """One pass: the community that every node joins, as the index of the node that founded it.
 
-    Nodes choose by the gain in modularity: the weight of the edge minus its expectation from the degrees.
-    """
+    Nodes choose by the gain in modularity: the weight of the edge minus its expectation from the degrees."""
     nodes = len(size)
     row, column = np.repeat(np.arange(nodes), np.diff(weight.indptr)), weight.indices
     gain = sharpness * (weight.data - degree[column] * degree[row] / total)

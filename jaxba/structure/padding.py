@@ -97,8 +97,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
 def slots_for(tracks: Int[np.ndarray, " points"]) -> int:
     """Number of slots that points with these numbers of observations need.
 
-    A point without observations gets a chunk, too, and one more is always empty.
-    """
+    A point without observations gets a chunk, too, and one more is always empty."""
     return POINT_CHUNK * (1 + int(np.sum(np.maximum(1, -(-tracks // POINT_CHUNK)))))
 
 

@@ -131,8 +131,7 @@ def sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
     """Stable `argsort` of integers from 0 to below `most`.
 
     NumPy sorts 16 bits in linear time, by radix; larger keys are sorted together with their positions in one integer,
-    for which its fastest sort need not be stable. Both take a tenth of the time of its stable sort of 32 bits.
-    """
+    for which its fastest sort need not be stable. Both take a tenth of the time of its stable sort of 32 bits."""
     if most <= 1 << 16:
         return np.argsort(keys.astype(np.uint16), kind="stable").astype(np.int32)
     bits = len(keys).bit_length()

@@ -125,8 +125,7 @@ def _bucket_lengths(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
     Every bucket adds to the size of the compiled program, so that their number is penalised: dynamic programming over
     the distinct lengths minimises `slots + penalty * buckets`, for penalties that are lowered until the padding is
-    within `_MAX_BUCKET_PADDING`.
-    """
+    within `_MAX_BUCKET_PADDING`."""
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
     # slots of a bucket, by its last and first length
