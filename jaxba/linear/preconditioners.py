@@ -27,12 +27,10 @@ from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 from jaxba.structure.unknowns import Unknowns
 
-Operator = Callable[[Array], Array]
-
 
 def preconditioner(
     system: DampedSystem, blocks: Float[Array, "blocks width width"] | None, name: Preconditioner
-) -> Operator:
+) -> Callable[[Array], Array]:
     """`M^-1` as a function of the residual; `blocks` are those of S, if they have been formed."""
     layout = system.layout
     if name == "jacobi":

@@ -89,8 +89,11 @@ def coarse_system(
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
     clusters, count = system.layout.part("clusters"), modes.shape[-1]
-    coupling = _similar_rows(system) if _follow_similarities(system.layout) else _coupling_rows(system, modes)
-    shared = sum_over_devices(system.layout, pair_products(clusters.pairs, coupling, count))
+    layout, unknowns = system.layout, system.layout.unknowns
+    # whether a similarity of cameras and points changes no residual, cluster by cluster
+    similar = unknowns.free.everywhere and not unknowns.in_rigs and not layout.residuals
+    coupling = _similar_rows(system) if similar else _coupling_rows(system, modes)
+    shared = sum_over_devices(layout, pair_products(clusters.pairs, coupling, count))
     own = jnp.einsum("cam,cab,cbn->cmn", modes, system.cameras.blocks, modes).reshape(-1, count**2)
     own = cluster_sum(clusters, own)
     own = jnp.concatenate([own, jnp.zeros((1, count**2), own.dtype)])
@@ -102,12 +105,6 @@ def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Flo
     """The sum of the rows of each cluster's cameras."""
     padded = jnp.concatenate([rows, jnp.zeros((1, rows.shape[1]), rows.dtype)])
     return jnp.sum(take_rows(padded, clusters.members), axis=1)
-
-
-def _follow_similarities(layout: Layout) -> bool:
-    """Whether a similarity of cameras and points changes no residual, cluster by cluster."""
-    unknowns = layout.unknowns
-    return unknowns.free.everywhere and not unknowns.in_rigs and not layout.residuals
 
 
 def _coupling_rows(system: DampedSystem, modes: Float[Array, "cameras width modes"]) -> Float[Array, "coarse rows"]:

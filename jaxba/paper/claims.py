@@ -6,6 +6,7 @@ or a fraction (all solves succeed). The report states the rules (`criterion` in 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
@@ -79,9 +80,7 @@ def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None, of:
     return Claim(text, f"{paper:.2f}", detail, status, near)
 
 
-def time_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
-    """The claim that `ours` takes the fraction `paper` of the seconds of `base`, by the rule of `ratio_claim`."""
-    return ratio_claim(text, paper, ours, base, "seconds")
+time_claim = functools.partial(ratio_claim, of="seconds")
 
 
 def longer_claim(text: str, paper: str, ours: Row | None, base: Row | None) -> Claim:

@@ -138,8 +138,7 @@ def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool
 
 def of_play(play: Play) -> list[Outcome]:
     """The outcomes on a set of scenes."""
-    cells = zip(play.iterations, play.converged, play.near, play.end, strict=True)
-    return [_outcome(iterations, converged, near, end) for iterations, converged, near, end in cells]
+    return [_outcome(*one) for one in zip(play.iterations, play.converged, play.near, play.end, strict=True)]
 
 
 def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Outcome]:

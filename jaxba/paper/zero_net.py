@@ -81,11 +81,8 @@ def initial_network(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> Ze
 def slope_of_next_cost(
     game: Game, episode: Episode, action: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Episode, StepInfo]:
-    """Makes one step, and differentiates its cost with respect to the action.
-
-    Returns: log10 of the candidate's cost over the current cost, its derivative with respect to the action, the episode
-        after the step, and the step. Rejected steps have these values too.
-    """
+    """Makes one step, rejected or not. Returns log10 of the candidate's cost over the current cost, its derivative by
+    the action, the episode after the step, and the step."""
 
     def play(action: Array) -> tuple[Array, tuple[Episode, StepInfo]]:
         after, step = game.iterate(game.kinds[0], game.banks[0], episode, action[None])

@@ -32,9 +32,8 @@ from jaxba.structure.segment_sums import total
 NEGLIGIBLE = 1e-6  # relative predicted decrease below which are no camera rounds or further trials. Source: Ceres
 
 POINT_DECREASE = 1e-2
-"""Candidates after the full step stop their point iterations once one lowers the cost by less than this fraction of the
-predicted decrease. Not the full step: with the same rule there, `ceres+refine3` took 34 instead of 22 iterations to a
-relative error of 1e-3 on kitti00vo."""
+"""Candidates after the full step stop their point iterations once one lowers the cost by less than this part of the
+prediction. Not the full step: `ceres+refine3` would take 34 instead of 22 iterations to 1e-3 on kitti00vo."""
 
 NEAR_CONVERGENCE = 1e-3  # predicted decrease, relative to the cost, below which both starts of points are refined
 COST_ROUNDING = 8.0  # relative rounding error of a cost in machine epsilons: 1e-6 in float32, 2e-15 in float64
@@ -126,16 +125,9 @@ def assess(
     repairs: Int[Array, ""],
     full_step: Bool[Array, ""],
 ) -> Candidate:
-    """Refines the points of a candidate and decides whether it is accepted.
-
-    Args:
-        against: data of the step.
-        cameras: cameras of the candidate.
-        points: points before their embedded iterations.
-        step_fraction: it scales the predicted decrease.
-        repairs: camera rounds, trials and pattern moves until then, with this one.
-        full_step: whether this is the full step, after which points may also start from their rays.
-    """
+    """Refines the points of a candidate, given before their embedded iterations, and decides whether it is accepted.
+    `step_fraction` scales the predicted decrease. `repairs` are camera rounds, trials and pattern moves until then,
+    with this one. `full_step`: whether this is the full step, after which points may also start from their rays."""
     layout = against.layout
     predicted = against.step.predicted(step_fraction)
     points, terms = _refined(against, cameras, points, predicted, full_step)

@@ -41,9 +41,8 @@ MAX_COST_RATIO = 1.5  # of a candidate for camera rounds: a limit of 10 ended 19
 MIN_GAINS = (-5.0, -0.5)  # of a candidate after one camera round, and after more, for another: none below was accepted
 
 ROUNDS_OF_LATER_CANDIDATES = 1
-"""Most camera rounds of a backtracked candidate or a pattern move. Measured on 457 held-out scenes with an agent
-for such steps: 6.40 iterations to within 1e-4 of the best cost with none for backtracked candidates, 6.02 with one,
-5.88 with three; on real problems three took a tenth more work than one."""
+"""Most camera rounds of a backtracked candidate or a pattern move. On 457 scenes 6.40 iterations to 1e-4 with none for
+backtracked candidates, 6.02 with one, 5.88 with three; on real problems three took a tenth more work than one."""
 
 GAIN_TOLERANCE = 0.25  # difference of the gain ratio from one up to which the linear model predicted the step
 SMALL_DAMPING_FRACTION = 0.1  # up to which a step is a Gauss-Newton step, and nothing is gained beyond it

@@ -107,19 +107,8 @@ def refine_from_starts(
     min_decrease: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """`refine_points` from one or two starts, of which the result with the lower cost is returned. The cost of a point
-    has several minima along its rays. Which is the lowest shows only after a few iterations.
-
-    Args:
-        layout: the problem's observations.
-        cameras: cameras after the step.
-        frames: camera of every slot, of these.
-        points: points after the step.
-        loss: robust loss.
-        iterations: iterations per point and start.
-        previous: points before the step.
-        starts: 0: start from `points`; 1: from the likelier of these and the midpoints; 2: from both.
-        min_decrease: see `refine_points`.
-    """
+    has several minima along its rays. Which is the lowest shows only after a few iterations. Arguments as there, after
+    the step; `starts`: 0: from `points`; 1: from the likelier of these and the midpoints; 2: from both."""
     choose = lambda *given: choose_starts(layout, given[0], given[1], given[2], loss, given[3])
     given = cameras, frames, points, previous
     candidates = loops.run_if(starts > 0, choose, given, jnp.stack([points, points]))

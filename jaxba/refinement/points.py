@@ -43,9 +43,8 @@ DAMPING_FACTOR = 10.0  # factor on a point's damping after a rejected step, and 
 
 MAX_DISTANCE_RATIO = 100.0
 """Largest growth of the distance of a point from its cameras by the step, and again by its own iterations. The distance
-is the harmonic mean of its depths, negative behind a camera; a point that starts behind its cameras has no limit.
-Chosen since the depths of a scene span two decades. With a ratio of 8 kitti00vo ended 3e-4 above the best known cost,
-with 100 it ended 2e-7 above."""
+is the harmonic mean of its depths, negative behind a camera; a point that starts behind its cameras has no limit. With
+a ratio of 8 kitti00vo ended 3e-4 above the best known cost, with 100 it ended 2e-7 above."""
 
 SMALL_DECREASE = 1e-2  # largest decrease of an iteration, relative to the cost, after which they may stop early
 

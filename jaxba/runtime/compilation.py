@@ -31,9 +31,7 @@ from jaxba.runtime.jit import Options, jit, quick_options, right_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, full once iterations pay for it."""
-
+Compilation = Literal["full", "quick", "auto"]  # optimised; hardly; hardly at first, fully once that pays
 Level = Literal["full", "quick"]  # how much one program is optimised
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"  # the option that switches XLA's newer kernel emitters off
 Kind = Literal["factorization", "iterative"]  # how a step solves its linear system

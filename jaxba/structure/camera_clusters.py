@@ -21,10 +21,7 @@ from jaxba.structure.track_buckets import Slots
 from jaxba.structure.unknowns import Unknowns
 from jaxba.typing import AnyArray, register_pytree
 
-CLUSTER_CAMERAS = 8
-"""Cameras per cluster, unless that makes more than `MAX_CLUSTERS`. Measured on real problems: as many conjugate
-gradient iterations as with 4, and down to half of those with 16."""
-
+CLUSTER_CAMERAS = 8  # or more, for at most `MAX_CLUSTERS`: as many iterations as with 4, down to half of those with 16
 MAX_CLUSTERS = 128  # at most 1280 coarse unknowns: factoring them costs two or three products with such a system
 
 

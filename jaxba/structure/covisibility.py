@@ -63,19 +63,11 @@ def pair_layout(
 ) -> PairLayout:
     """Lists all pairs of observations of one point, sorted by the block that they add to.
 
-    Args:
-        camera: camera of each observation; observations are sorted by point.
-        row_index: row of each observation among those that are multiplied (its camera-sorted index).
-        tracks: number of observations of each point.
-        start: position of the first observation of each point.
-        cameras: number of cameras.
-        empty: index of a row of zeros.
-        factor: whether the system will be factored.
-        banded: whether it may be factored as a band, where that is cheaper.
-        capacity: fixed sizes from which all shapes follow: every block of the lower triangle is listed, and no band is
-            used.
-        agreement: with the other shards of a problem, which have the same blocks.
-    """
+    Observations are sorted by point; each has its `camera` and its row among those that are multiplied (its
+    camera-sorted index). Of each point there are the number of observations (`tracks`) and the position of the first.
+    `empty` is the index of a row of zeros. `factor`: whether the system will be factored; `banded`: whether as a band,
+    where that is cheaper. With a `capacity` all shapes follow from that: every block of the lower triangle is listed,
+    and no band is used. The other shards of a problem (`agreement`) have the same blocks."""
     camera, row_index = camera.astype(np.int32), row_index.astype(np.int32)
     left, right = _pairs_of_tracks(tracks, start)
     rows, columns = camera[left], camera[right]
@@ -208,15 +200,8 @@ def _batch_sums(
     loosest: bool = False,
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
     """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
-
-    Args:
-        chunks: number of chunks of each block; those of one block are contiguous.
-        batches: number of batches.
-        batch: number of chunks of a batch.
-        most: largest number of chunks of a block, if all shapes shall follow from that and from the numbers above.
-        agreement: with the other shards of a problem.
-        loosest: whether there is room for the worst case.
-    """
+    `chunks` are numbers of chunks of blocks, which are contiguous, `batch` is that of a batch, `most` the largest of a
+    block, if all shapes shall follow from these; `loosest`: whether there is room for the worst case."""
     block = np.repeat(np.arange(len(chunks)), chunks)
     own_batch, position = np.divmod(np.arange(len(block)), batch)
     is_start = (np.diff(block, prepend=-1) != 0) | (position == 0)  # first chunk of a block within a batch

@@ -3,12 +3,8 @@
 An *observation slot*, slot for short, is a position in the arrays over observations; it holds one observation or is
 empty. Points with similar numbers of observations form a bucket; in a bucket, `n` points with up to `t` observations
 each own a tile of `t x n` slots, so that the sum over the observations of a point is a dense sum over `t`
-(structure/track_buckets.py).
-
-Sums over a camera, or over a block of the reduced camera system, are *summation trees* (structure/sum_trees.py): rows
-are gathered in chunks of fixed width that belong to one target and summed densely, then the partial sums in the same
-way, until there is one row per target. There are no scatter operations. Padding of the index arrays refers to an empty
-slot, whose values are exactly zero.
+(structure/track_buckets.py). Sums over a camera, or over a block of the reduced camera system, are *summation trees*
+(structure/sum_trees.py). Padding of the index arrays refers to an empty slot, whose values are exactly zero.
 
 The rows of the first level of the camera tree list the slots sorted by camera. The position of a slot in this list is
 its *camera-sorted index*.

@@ -90,15 +90,12 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     five levels of Ladybug-49, padded."""
     for level in levels:
         if rows.ndim > 2:
-            rows = compute_unfused(_level_sum, rows, jnp.asarray(level), index=level)
+            level_sum = lambda rows, level: jnp.sum(take_rows(rows, level), axis=1)
+            rows = compute_unfused(level_sum, rows, jnp.asarray(level), index=level)
             continue
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
         rows = functools.reduce(operator.add, parts)
     return rows
-
-
-def _level_sum(rows: Array, level: Array) -> Array:
-    return jnp.sum(take_rows(rows, level), axis=1)
 
 
 UNROLLED_RANKS = 4  # ranks of a level up to which each is gathered by itself. More take long to compile.

@@ -88,7 +88,6 @@ class Mask(ArrayRecord):
     """Where something holds."""
 
     values: Bool[AnyArray, "..."]
-
     everywhere: bool = field(metadata={"static": True})  # whether it holds everywhere, so that there is nothing to do
 
     @classmethod

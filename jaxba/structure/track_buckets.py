@@ -18,9 +18,8 @@ from jaxba.structure.sum_trees import prefix_levels
 MAX_PADDING = 0.10  # largest number of empty slots relative to observations, besides one point of padding
 
 TILE = 8
-"""Points per tile of a large bucket, as many as the widest vector registers hold. A pass over the points reads one
-memory stream per observation of a point; without tiles these are a whole bucket apart, too many for the prefetcher and
-the TLB: a pass was measured to take twice as long."""
+"""Points per tile of a large bucket, as many as the widest vector registers hold. Without tiles a pass took twice as
+long: it reads a memory stream per observation of a point, a whole bucket apart, too many for prefetcher and TLB."""
 
 TILED_POINTS = 512  # smaller buckets are a single tile: they fit the cache, and need no padding to a multiple of `TILE`
 _MAX_BUCKET_PADDING = (1 + MAX_PADDING) / (1 + (TILE - 1) / TILED_POINTS) - 1  # what padding to tiles leaves

@@ -89,8 +89,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            check_count(name, getattr(self, name), 1)
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 to 2147483647, not {self.seed}")
         if len(self.envs) != len(self.bank.classes):

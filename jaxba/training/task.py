@@ -136,24 +136,20 @@ def build(
     line when something long begins; `baselines` are names to compare with, unless the folder has results; `BASELINES`
     if None; `on_game` is called with the game first. Raises ValueError: too few scenes are usable, or another version
     wrote the files; one line for a person. Raises OSError: the folder cannot be written or read."""
-    splits = _splits(config, folder, report)
+    path = folder / BANK
+    if path.is_file():
+        report("reading the scenes")
+        splits = read_banks(path)
+    else:
+        key, limit = jax.random.key(config.seed), config.game.max_iterations
+        splits = make_banks(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
+        _write_banks(path, splits)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
     on_game(game)
     runs = _baseline_runs(config, folder, game, held_out, report, baselines)
     return Task(config, game, held_out, runs)
-
-
-def _splits(config: TrainConfig, folder: Path, report: Callable[[str], None]) -> list[Split]:
-    path = folder / BANK
-    if path.is_file():
-        report("reading the scenes")
-        return read_banks(path)
-    key, limit = jax.random.key(config.seed), config.game.max_iterations
-    splits = make_banks(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
-    _write_banks(path, splits)
-    return splits
 
 
 def _baseline_runs(

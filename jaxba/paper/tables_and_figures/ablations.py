@@ -83,11 +83,7 @@ TABLES = (
         ],
         lambda runner: {"net": runner.config.zero_net},
     ),
-    _ablation(
-        "state-size",
-        _sized,
-        _size_statements,
-    ),
+    _ablation("state-size", _sized, _size_statements),
     _ablation(
         "reversed",
         lambda runner: [Line("reversed: 5 durations, error", runner.agent(agents.REVERSED), 10.0)],
