@@ -26,22 +26,15 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.unknowns import Unknowns
 
-Solve = Callable[[Array], Array]
-"""A linear function of arrays [cameras, width] or [cameras, width, columns]."""
+Solve = Callable[[Array], Array]  # a linear function of arrays [cameras, width] or [cameras, width, columns]
 
 
 def bordered(
     unknowns: Unknowns, product: Solve, inner: Solve, like: Float[Array, "cameras width"], *, store: bool
 ) -> Solve:
-    """`T (T^T S T)^-1 T^T` for shared lenses; non-finite if the system is not positive definite.
-
-    Args:
-        unknowns: T. Where no lens is shared there is no border.
-        product: product with S.
-        inner: `A^-1`, for `without_lenses` of S.
-        like: array of the shape and type of a right-hand side.
-        store: whether `A^-1 B` is stored for several right-hand sides, and not computed along with the only one.
-    """
+    """`T (T^T S T)^-1 T^T` for shared lenses; non-finite if the system is not positive definite. `product` is that with
+    S, `inner` is `A^-1`, for `without_lenses` of S, and `like` has the shape and type of a right-hand side. `store`:
+    whether `A^-1 B` is stored for several right-hand sides, and not computed along with the only one."""
     lenses, numbers = unknowns.lenses, len(unknowns.columns)
     if not lenses.several:
         return inner

@@ -18,14 +18,9 @@ from jaxtyping import Float
 
 from jaxba.runtime import loops
 
-PANEL = 128
-"""Columns of a panel. Measured with 1350 unknowns: 11 ms with 128, 13 with 192, 16 with 256, 20 in one LAPACK call."""
-
-MAX_PANELS = 24
-"""Most panels. The loop over them is unrolled, so their number decides the size of the program."""
-
-MIN_UNKNOWNS = 512
-"""Smaller systems go to LAPACK: 441 unknowns were measured to take 1 ms either way."""
+PANEL = 128  # columns of a panel. With 1350 unknowns: 11 ms with 128, 13 with 192, 16 with 256, 20 in one LAPACK call
+MAX_PANELS = 24  # most panels. The loop over them is unrolled, so their number decides the size of the program.
+MIN_UNKNOWNS = 512  # smaller systems go to LAPACK: 441 unknowns were measured to take 1 ms either way
 
 
 class Panels(NamedTuple):
@@ -105,8 +100,7 @@ def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Pane
 def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
 
-    Not by LAPACK: batched calls in nested loops deadlocked on a CPU (jax 0.10.2, two threads, 64 scenes).
-    """
+    Not by LAPACK: batched calls in nested loops deadlocked on a CPU (jax 0.10.2, two threads, 64 scenes)."""
 
     def eliminate(k: Array, table: Array) -> Array:
         row = table[:, k] / table[:, k, k, None]

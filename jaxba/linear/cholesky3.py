@@ -8,9 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-PIVOT_FLOOR = 16.0
-"""Smallest pivot, in machine epsilons times its diagonal entry. A point with parallel rays has a singular block; with
-this floor its step stays finite, and one such point does not make the whole step fail."""
+PIVOT_FLOOR = 16.0  # least pivot, in machine epsilons of its diagonal: with parallel rays a step stays finite
 
 
 class Cholesky3(NamedTuple):

@@ -24,8 +24,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_rows
 from jaxba.structure.unknowns import Unknowns
 
-FLOAT32_SHIFT = 64.0
-"""Machine epsilons added to the unit diagonal of a scaled float32 system, which rounding may have made indefinite."""
+FLOAT32_SHIFT = 64.0  # machine epsilons added to the unit diagonal of a scaled float32 system, indefinite by rounding
 
 
 def in_full(layout: Layout) -> bool:

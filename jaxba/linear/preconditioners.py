@@ -27,12 +27,10 @@ from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 from jaxba.structure.unknowns import Unknowns
 
-Operator = Callable[[Array], Array]
-
 
 def preconditioner(
     system: DampedSystem, blocks: Float[Array, "blocks width width"] | None, name: Preconditioner
-) -> Operator:
+) -> Callable[[Array], Array]:
     """`M^-1` as a function of the residual; `blocks` are those of S, if they have been formed."""
     layout = system.layout
     if name == "jacobi":
@@ -68,8 +66,7 @@ def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]
 
     With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
     observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the
-    two observations is missing, which is harmless in a preconditioner.
-    """
+    two observations is missing, which is harmless in a preconditioner."""
     layout, (over, under) = system.layout, system.points.projected
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     f00 = safe_sqrt(jnp.maximum(1 - dot(over, over), 0))

@@ -12,7 +12,6 @@ Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,19 +26,25 @@ from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import DampedSystem, apply_reduced
 from jaxba.problem.options import StepOptions
 
-CORRECTION_FORCING = 1e-3
-"""Forcing term of the float64 conjugate gradients around a float32 factorisation; they take two or three products."""
-
-T = TypeVar("T")
+_IN_SINGLE = ("linear", "points", "cameras", "parameters")  # what of a system is float32 in mixed precision
+CORRECTION_FORCING = 1e-3  # forcing term of the float64 conjugate gradients around a float32 factorisation
 
 
 def solve_reduced(system: DampedSystem, options: StepOptions) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the options name. Returns the
     step and the number of iterations (0 for a factorisation). The step is non-finite if a factorisation failed."""
     right, mixed = system.cameras.right, options.mixed_precision
-    single = system._replace(**to_single({name: getattr(system, name) for name in _IN_SINGLE})) if mixed else system
+    single = system
+    if mixed:
+        parts = {name: getattr(system, name) for name in _IN_SINGLE}
+        single = system._replace(**jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), parts))
     if options.linear_solver != "explicit":
-        step, iterations = _iterated(single, options)
+        blocks, apply = None, lambda x: apply_reduced(single, x)
+        if options.linear_solver == "sparse":
+            formed = blocks = reduced_blocks(single)
+            apply = lambda x: apply_blocks(single.layout, formed, x)
+        inverse = preconditioner(single, blocks, options.conjugate_gradients.preconditioner)
+        step, iterations = _conjugate_gradients(single, apply, inverse, options)
         return step.astype(right.dtype), iterations
     if not mixed or in_full(system.layout):
         return factored(system)(right), jnp.zeros((), jnp.int32)
@@ -47,25 +52,6 @@ def solve_reduced(system: DampedSystem, options: StepOptions) -> tuple[Float[Arr
     precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
     corrected = system._replace(forcing=CORRECTION_FORCING)
     return _conjugate_gradients(corrected, lambda x: apply_reduced(system, x), precondition, options)
-
-
-_IN_SINGLE = ("linear", "points", "cameras", "parameters")
-"""What of a system is float32 in mixed precision."""
-
-
-def to_single(tree: T) -> T:
-    """All floating point arrays in float32; booleans are unchanged."""
-    return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), tree)
-
-
-def _iterated(system: DampedSystem, options: StepOptions) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
-    blocks = None
-    apply = lambda x: apply_reduced(system, x)
-    if options.linear_solver == "sparse":
-        formed = blocks = reduced_blocks(system)
-        apply = lambda x: apply_blocks(system.layout, formed, x)
-    precondition = preconditioner(system, blocks, options.conjugate_gradients.preconditioner)
-    return _conjugate_gradients(system, apply, precondition, options)
 
 
 def _conjugate_gradients(

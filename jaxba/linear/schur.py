@@ -142,8 +142,7 @@ def camera_system(
 ) -> CameraSystem:
     """B + D_c, g_c and b of every camera.
 
-    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b: one pass for all.
-    """
+    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b: one pass for all."""
     solved = take(jnp.stack(points.solved), layout.slot_point)
     rows = []
     for k in range(2):
@@ -250,8 +249,7 @@ def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: Ste
     """Diagonal of D for a Hessian with the given diagonal.
 
     `lambda I` for identity scaling, else `lambda diag(H)` with the diagonal clamped to
-    [`DIAGONAL_MINIMUM`, `DIAGONAL_MAXIMUM`] as in Ceres.
-    """
+    [`DIAGONAL_MINIMUM`, `DIAGONAL_MAXIMUM`] as in Ceres."""
     if options.coordinates.scaling == "identity":
         return jnp.full_like(diagonal, 1) * damping
     high = min(DIAGONAL_MAXIMUM, float(jnp.finfo(diagonal.dtype).max) / 4)

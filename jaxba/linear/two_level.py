@@ -36,15 +36,9 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 from jaxba.structure.sharing import Sharing
 
-SIMILARITY = 7
-"""Columns of a similarity; those of the numbers of lenses follow."""
-
-SHIFT = 64.0
-"""Machine epsilons per coarse unknown added to the unit diagonal of the scaled coarse system, which is singular where a
-cluster has one camera: it has a column more than unknowns."""
-
-COARSE_PANEL = 256
-"""Columns of a panel of the coarse factor. With 1280 unknowns as fast as 128, a second less of compilation."""
+SIMILARITY = 7  # columns of a similarity; those of the numbers of lenses follow
+SHIFT = 64.0  # machine epsilons per unknown added to the diagonal, singular for clusters of one camera
+COARSE_PANEL = 256  # columns of a panel of the coarse factor: with 1280 unknowns as fast as 128, compiled sooner
 
 
 def camera_modes(
@@ -53,8 +47,7 @@ def camera_modes(
     """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for unseen cameras.
 
     For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all projections is
-    `-R a` for the rotation and `-R b + s t` for the translation.
-    """
+    `-R a` for the rotation and `-R b + s t` for the translation."""
     minus_rotation = -jnp.moveaxis(rotation_matrix(cameras[:3]), -1, 0)
     count = minus_rotation.shape[0]
     numbers = width - POSE_SIZE
@@ -96,8 +89,11 @@ def coarse_system(
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
     clusters, count = system.layout.part("clusters"), modes.shape[-1]
-    coupling = _similar_rows(system) if _follow_similarities(system.layout) else _coupling_rows(system, modes)
-    shared = sum_over_devices(system.layout, pair_products(clusters.pairs, coupling, count))
+    layout, unknowns = system.layout, system.layout.unknowns
+    # whether a similarity of cameras and points changes no residual, cluster by cluster
+    similar = unknowns.free.everywhere and not unknowns.in_rigs and not layout.residuals
+    coupling = _similar_rows(system) if similar else _coupling_rows(system, modes)
+    shared = sum_over_devices(layout, pair_products(clusters.pairs, coupling, count))
     own = jnp.einsum("cam,cab,cbn->cmn", modes, system.cameras.blocks, modes).reshape(-1, count**2)
     own = cluster_sum(clusters, own)
     own = jnp.concatenate([own, jnp.zeros((1, count**2), own.dtype)])
@@ -109,12 +105,6 @@ def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Flo
     """The sum of the rows of each cluster's cameras."""
     padded = jnp.concatenate([rows, jnp.zeros((1, rows.shape[1]), rows.dtype)])
     return jnp.sum(take_rows(padded, clusters.members), axis=1)
-
-
-def _follow_similarities(layout: Layout) -> bool:
-    """Whether a similarity of cameras and points changes no residual, cluster by cluster."""
-    unknowns = layout.unknowns
-    return unknowns.free.everywhere and not unknowns.in_rigs and not layout.residuals
 
 
 def _coupling_rows(system: DampedSystem, modes: Float[Array, "cameras width modes"]) -> Float[Array, "coarse rows"]:

@@ -6,14 +6,7 @@ the cost is
     m(d) = |r + J d|^2 / 2 = f + g.d + d.H d / 2,    g = J^T r,    H = J^T J,
 
 and the damped step d solves `(H + D) d = -g`, where D is `lambda diag(H)` or `lambda I` (times a constant for cameras).
-With cameras c and points p:
-
-    [ B + D_c     E     ] [ d_c ]     [ g_c ]
-    [   E^T     C + D_p ] [ d_p ] = - [ g_p ]
-
-    1. S   = B + D_c - E (C + D_p)^-1 E^T            linear/schur.py: eliminate the points
-    2. d_c = S^-1 (-g_c + E (C + D_p)^-1 g_p)        a method (lm/method.py)
-    3. d_p = -(C + D_p)^-1 (g_p + E^T d_c)           linear/schur.py: back-substitution
+linear/schur.py eliminates the points, a method (lm/method.py) solves for the cameras, and the points follow.
 
 Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4 and 6.
 """
@@ -45,15 +38,9 @@ def solve_step(
 ) -> Step:
     """Solves `(H + D) d = -g` for cameras and points. The step is non-finite if a factorisation failed.
 
-    Args:
-        layout: the problem's observations; must list pairs if the options form the reduced camera system.
-        linear: residuals and Jacobians at the current parameters.
-        cameras: current cameras; they define the rotation coordinates.
-        points: current points; they define the coarse space of the two-level preconditioner.
-        damping: lambda, dimensionless for diagonal scaling.
-        options: linear solver or method, scaling and coordinates.
-        iteration: number of the iteration; selects the random clusters of methods that use them.
-    """
+    `linear` is at the current cameras, which define the rotation coordinates, and points, which define the coarse space
+    of the two-level preconditioner. `damping` is lambda, dimensionless for diagonal scaling. The number of the
+    iteration selects the random clusters of methods that use them."""
     forcing = (options.truncated or options.conjugate_gradients).forcing
     system = DampedSystem.of(layout, linear, cameras, points, damping, options)
     system = system._replace(forcing=forcing, iteration=iteration)
@@ -89,8 +76,7 @@ def _slope_and_damping(
 
         m(0) - m(d) = -g.d - d.H d / 2 = (d.D d - g.d + d.e) / 2.
 
-    `d.e` is zero for a factorisation, and for conjugate gradients from zero. The other two terms are positive.
-    """
+    `d.e` is zero for a factorisation, and for conjugate gradients from zero. The other two terms are positive."""
     points, cameras = system.points, system.cameras
     of_points = jnp.sum(jnp.stack(points.gradient) * point_step), jnp.sum(jnp.stack(points.damping) * point_step**2)
     slope, damped = sum_over_devices(system.layout, of_points)

@@ -73,7 +73,7 @@ def check_plain(options: StepOptions, error: type[ValueError] = ValueError, **as
             raise error(PLAIN_ONLY[what].format(options.solver_name))
 
 
-PLAIN_ONLY = {
+PLAIN_ONLY = {  # what only plain LM has, with the message of its refusal for the name of another method
     "rigs": "rigs need plain LM, not {}",
     "shared_lenses": "shared lenses need plain LM, not {}",
     "residuals": "priors and residuals of your own need plain LM, not {}",
@@ -81,4 +81,3 @@ PLAIN_ONLY = {
     "mixed": "mixed types are for plain LM; methods have float64 or float32",
     "linear_solver": "linear_solver is for method lm; {} has its own",
 }
-"""What only plain LM has, with the message of its refusal for the name of another method."""

@@ -28,8 +28,7 @@ class LMState(NamedTuple):
 class StepInfo(NamedTuple):
     """Record of one iteration. A damping policy sees this and nothing else of the solve.
 
-    That of all iterations of a solve has an array for each field, with an entry for each iteration.
-    """
+    That of all iterations of a solve has an array for each field, with an entry for each iteration."""
 
     cost: Float[Array, ""]
     """Accepted cost after the iteration, pixels^2."""

@@ -106,7 +106,12 @@ def propose(
     layout: Layout, state: LMState, damping: Float[Array, ""], options: StepOptions, iteration: int | Int[Array, ""] = 0
 ) -> Proposal:
     """First part of `lm_step`: linearise and solve the damped system. Arguments as for `lm_step`."""
-    _check_lenses(layout, options)
+    unknowns = layout.unknowns
+    if unknowns.poses.several:
+        apart = options.refinement.camera_rounds or options.refinement.pattern_moves
+        if options.coordinates.rotation != "manifold" or apart:
+            raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
+    check_plain(options, shared_lenses=unknowns.shared, residuals=bool(layout.residuals))
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = only_free(layout, linear, options.intrinsics)
@@ -159,13 +164,3 @@ def take_step(
         weightless=proposal.weightless,
         repairs=candidate.repairs,
     )
-
-
-def _check_lenses(layout: Layout, options: StepOptions) -> None:
-    """Raises a ValueError for what a method does not support."""
-    unknowns = layout.unknowns
-    if unknowns.poses.several:
-        apart = options.refinement.camera_rounds or options.refinement.pattern_moves
-        if options.coordinates.rotation != "manifold" or apart:
-            raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
-    check_plain(options, shared_lenses=unknowns.shared, residuals=bool(layout.residuals))

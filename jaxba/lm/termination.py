@@ -19,20 +19,13 @@ from jaxtyping import Bool, Float, Int
 from jaxba.lm.records import StepInfo
 from jaxba.refinement.acceptance import COST_ROUNDING
 
-DAMPING_LIMIT = 1e32
-"""A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
-
-MAX_UNDAMPED_RATIO = 100.0
-"""A small decrease or short step is convergence only if, undamped, it is at most so many times as large."""
-
-FRACTION_ROUNDING = 64.0
-"""Machine epsilons within which a damping fraction is one: with lambda = 1e30 it was computed just below."""
-
+DAMPING_LIMIT = 1e32  # a step rejected with such a lambda ends the solve. Source: Ceres, min_trust_region_radius
+MAX_UNDAMPED_RATIO = 100.0  # a small decrease or short step is convergence if, undamped, at most so many times as large
+FRACTION_ROUNDING = 64.0  # machine epsilons within which a damping fraction is one: for 1e30 it was just below
 
 LEFT_BY_DAMPING, LEAST_LEFT, MOST_LEFT = 3000.0, 0.01, 300.0
 """What is left after a step, in units of its decrease, is at most the first number times the damping fraction, between
-the other two. Of the default's steps on half of 200 real and random problems, these hold the distance to the end in 95
-of 100 solves (`python -m benchmarks.default_policy --within`)."""
+the other two: so in 95 of 100 solves by the default (`python -m benchmarks.default_policy --within`)."""
 
 
 class Termination(enum.IntEnum):
@@ -83,8 +76,7 @@ _REASONS = {
 class Tolerances(NamedTuple):
     """Tolerances of the convergence tests, and a target cost. The defaults are those of Ceres.
 
-    `ftol` and `xtol` apply to accepted steps. Rejected steps end a solve by `lost_in_rounding`.
-    """
+    `ftol` and `xtol` apply to accepted steps. Rejected steps end a solve by `lost_in_rounding`."""
 
     ftol: float = 1e-6
     """An accepted step with `f - f_new <= ftol f` that damping did not make short (`converged_in_cost`)."""
@@ -108,8 +100,7 @@ def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:
 
     What is left to do after a step is what damping kept it from doing. Where damping has no share of it (the fraction
     is zero), next steps decrease the cost by far less than this one; in a flat valley, where it has, by as much for
-    many times. `where` is NumPy's for records of NumPy arrays.
-    """
+    many times. `where` is NumPy's for records of NumPy arrays."""
     decrease, share = (step.previous_cost - step.cost) / step.cost, step.damping_fraction
     # of one direction the undamped model predicts s^2 / (1 - s^2) times the decrease (`converged_in_cost`)
     left = decrease * (LEFT_BY_DAMPING * share).clip(LEAST_LEFT, MOST_LEFT) / (1 - share**2)
@@ -121,8 +112,7 @@ def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
 
     Let `s = d.D d / d.(H + D) d` be the damping fraction. Along a direction of curvature h it is
     `s = lambda / (h + lambda)`, and the undamped model predicts `1 / (1 - s^2)` times the decrease.
-    This estimate may be at most `MAX_UNDAMPED_RATIO` times the tolerance.
-    """
+    This estimate may be at most `MAX_UNDAMPED_RATIO` times the tolerance."""
     return step.accepted & _is_negligible(step.previous_cost - step.cost, step, ftol)
 
 
@@ -130,8 +120,7 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
     """Whether a step was rejected whose predicted decrease is below the rounding error of the cost.
 
     Such a rejection says nothing about the step, and the next steps, damped more, predict even less. In float64 this is
-    far below useful tolerances. In float32 it happens before `ftol` is met.
-    """
+    far below useful tolerances. In float32 it happens before `ftol` is met."""
     rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
     known = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not report rejected steps (peers/driven.py)
     return ~step.accepted & known & _is_negligible(step.predicted, step, rounding)

@@ -30,10 +30,10 @@ from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 class GlobalConjugateGradients(StepMethod):
     """The method `deeplm`."""
 
+    # stopping rule; the preconditioner field is ignored. Source of 1e-3 and 150: the authors' code.
     conjugate_gradients: ConjugateGradients = field(
         default_factory=lambda: ConjugateGradients(forcing=1e-3, max_iterations=150)
     )
-    """Stopping rule; the preconditioner field is ignored. Source of 1e-3 and 150: the authors' code."""
 
     name = "deeplm"
 

@@ -7,8 +7,8 @@ Each iteration draws a partition of the cameras into clusters (structure/random_
 2. A few Richardson iterations on the true reduced camera system correct the camera step.
 3. The points follow by back-substitution, unsplit.
 
-Lambda damps cameras, points and replicas. With a large lambda the step is nearly a
-steepest-descent step, in which the replicas of a point differ; `consensus_gradient` makes them agree.
+Lambda damps cameras, points and replicas. With a large lambda the step is nearly a steepest-descent step, in which the
+replicas of a point differ; `consensus_gradient` makes them agree.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,
 and the authors' code.
@@ -28,7 +28,7 @@ from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.linear.formed import reduced_blocks
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced, damping_diagonal, lift_to_cameras
+from jaxba.linear.schur import DampedSystem, apply_reduced, damping_diagonal, lift_to_cameras
 from jaxba.lm.method import MethodStep, StepMethod
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import StepOptions, check_count
@@ -38,9 +38,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, take_each, take_rows, tree_sum
 
-MIN_CONSENSUS_DAMPING = 1.0
-"""Smallest lambda for which gradients of replicas agree. Source: the authors' code (radius at most 1)."""
-
+MIN_CONSENSUS_DAMPING = 1.0  # smallest lambda for which gradients of replicas agree. Source: the authors' code
 
 SplitSystem: TypeAlias = tuple[list[list[Array]], list[Array]]
 """The eliminated point replicas (linear/schur.py), of each slot's replica: Q = J_p L^-T, [2][3] of (slots,), and
@@ -51,11 +49,8 @@ h = L^-1 g, [3] of (slots,)."""
 class StochasticClusters(StepMethod):
     """The method `stba`."""
 
-    cluster_cameras: int = 100
-    """Largest number of cameras in a cluster. Source: the authors' code."""
-
-    repairs: int = 4
-    """Richardson iterations on the true system after the clusters' solution. Source: the authors' code."""
+    cluster_cameras: int = 100  # largest number of cameras in a cluster. Source: the authors' code
+    repairs: int = 4  # Richardson iterations on the true system after the clusters' solution. Source: the authors' code
 
     name = "stba"
     rule = "stba"
@@ -79,7 +74,7 @@ def clustered_step(
     layout has pairs; `partition` is that of this iteration, and `repairs` the number of Richardson iterations."""
     layout, linear, points, cameras, damping = system[:5]
     split = eliminate_replicas(layout, linear, damping, partition, options)
-    right = split_right_hand_side(layout, linear, cameras, split)
+    right = lift_to_cameras(layout, linear, *split) - cameras.gradient  # -sum J_c^T (r - Q h)
     parts = system._replace(points=points._replace(projected=split[0]))
     return richardson(system, solve_clusters(parts, right, partition), repairs)
 
@@ -124,22 +119,19 @@ def consensus_gradient(
     return jnp.where(diagonal_sum > 0, diagonal * sums[:3] / jnp.where(diagonal_sum > 0, diagonal_sum, 1), gradient)
 
 
-def split_right_hand_side(
-    layout: Layout, linear: Linearization, system: CameraSystem, split: SplitSystem
-) -> Float[Array, "cameras width"]:
-    """Right-hand side of the split system, `-sum J_c^T (r - Q h)`."""
-    return lift_to_cameras(layout, linear, *split) - system.gradient
-
-
 def solve_clusters(
     system: DampedSystem, right: Float[Array, "cameras width"], partition: Partition
 ) -> Float[Array, "cameras width"]:
     """Solves the block-diagonal system of damped camera blocks, one dense factorisation per cluster; of its points only
     `projected` is used, which couples the cameras of a cluster. Returns the camera step, in manifold coordinates;
     non-finite for a cluster whose factorisation failed."""
-    matrices = cluster_matrices(system, partition)
+    blocks = reduced_blocks(system)
+    blocks = jnp.concatenate([blocks, jnp.eye(blocks.shape[-1], dtype=blocks.dtype)[None]])
+    clusters, size = partition.members.shape
+    table = take_rows(blocks, partition.blocks)  # the lower triangle of the block of each cluster
+    matrices = table.transpose(0, 1, 3, 2, 4).reshape(clusters, size * blocks.shape[-1], -1)
     padded = jnp.concatenate([right, jnp.zeros((1, right.shape[1]), right.dtype)])
-    rights = take_rows(padded, partition.members).reshape(partition.members.shape[0], -1)
+    rights = take_rows(padded, partition.members).reshape(clusters, -1)
     # large systems are solved one by one on a CPU, where each factorisation uses all cores
     if jax.default_backend() == "cpu" and rights.shape[1] >= MIN_UNKNOWNS:
         steps = lax.map(lambda pair: factor_and_solve(*pair), (matrices, rights))
@@ -148,15 +140,6 @@ def solve_clusters(
     steps = steps.reshape(*partition.members.shape, -1)
     # every camera is in one cluster; padding writes to the extra last row
     return jnp.zeros_like(padded).at[partition.members].set(steps)[:-1]
-
-
-def cluster_matrices(system: DampedSystem, partition: Partition) -> Float[Array, "clusters n n"]:
-    """The diagonal block of each cluster in the split system; only its lower triangle is filled."""
-    blocks = reduced_blocks(system)
-    blocks = jnp.concatenate([blocks, jnp.eye(blocks.shape[-1], dtype=blocks.dtype)[None]])
-    clusters, size = partition.members.shape
-    table = take_rows(blocks, partition.blocks)
-    return table.transpose(0, 1, 3, 2, 4).reshape(clusters, size * blocks.shape[-1], -1)
 
 
 def richardson(system: DampedSystem, step: Array, rounds: int) -> Float[Array, "cameras width"]:

@@ -31,8 +31,7 @@ from jaxba.structure.segment_sums import take, take_each
 from jaxba.structure.unknowns import BAL_UNKNOWNS, Unknowns
 from jaxba.typing import AnyArray
 
-EVERYWHERE = np.array(True)
-"""A mask that masks nothing; XLA removes it."""
+EVERYWHERE = np.array(True)  # a mask that masks nothing; XLA removes it
 
 
 class Frames(NamedTuple):
@@ -48,8 +47,7 @@ class Frames(NamedTuple):
     def at(self, index: Int[AnyArray, " n"]) -> Frames:
         """The frames of the cameras in `index`.
 
-        Computed once per camera: a fusion barrier keeps XLA from computing rotations again for every index.
-        """
+        Computed once per camera: a fusion barrier keeps XLA from computing rotations again for every index."""
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
         rows = [row for place in self.places for row in place]
         table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens, *rows]))

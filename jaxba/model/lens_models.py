@@ -16,11 +16,8 @@ from jaxba.typing import AnyArray
 
 Pair = tuple[Array, Array]
 
-Which = tuple[Int[Array, "..."], ...]
-"""Position of each camera's model, if there are several."""
-
-Rows = tuple[list[list[Array]], Callable[[int], Pair]]
-"""`dz/dP`, [2][3], and `dz/d number k of the lens` as a function of k."""
+Which = tuple[Int[Array, "..."], ...]  # position of each camera's model, if there are several
+Rows = tuple[list[list[Array]], Callable[[int], Pair]]  # `dz/dP`, [2][3], and `dz/d number k of the lens`
 
 
 class Projection(NamedTuple):
@@ -48,8 +45,7 @@ class Projection(NamedTuple):
 class BalLens:
     """BAL's model, with `d = 1 + k1 |p|^2 + k2 |p|^4` and its derivative `e = k1 + 2 k2 |p|^2` by `|p|^2`:
 
-    dz/dp = f (d I + 2 e p p^T)      dp/dP = -[I | p] / P.z      dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p
-    """
+    dz/dp = f (d I + 2 e p p^T)      dp/dP = -[I | p] / P.z      dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p"""
 
     def masked(self, local: list[Array], mask: AnyArray) -> list[Array]:
         """Points that may be projected: BAL's formulas are finite wherever the inverse depth is."""

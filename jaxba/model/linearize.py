@@ -21,7 +21,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.compilation import traced_once
-from jaxba.runtime.fusion import compute_unfused
+from jaxba.runtime.fusion import compute_unfused, fast_compilation, fusion_barrier
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
@@ -38,8 +38,7 @@ class Linearization(NamedTuple):
     """Whitened and weighted residuals and Jacobians; everything is zero in empty slots.
 
     Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians), translation, then the numbers
-    of the lens that are unknown (structure/unknowns.py): f, k1 and k2 of BAL.
-    """
+    of the lens that are unknown (structure/unknowns.py): f, k1 and k2 of BAL."""
 
     residual: list[Array]  # [2] of (slots,), pixels
     camera_jacobian: list[list[Array]]  # [2][width] of (slots,)
@@ -91,7 +90,9 @@ def point_terms(views: Views, loss: Loss) -> list[Array]:
     projection = views.projected()
     residual = view_residuals(views, projection)
     by_point = _whiten_columns(views, camera.derivatives(views.frames, projection, ())[1])
-    rows = views.materialized([*by_point[0], *by_point[1], *residual])
+    rows = [*by_point[0], *by_point[1], *residual]
+    if fast_compilation.value:  # computed once for several uses
+        rows = list(fusion_barrier(jnp.stack(rows)))
     residual = rows[6:]
     entries = normal_entries([rows[:3], rows[3:6]], residual)
     if not loss.trivial:

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.model import camera
-from jaxba.runtime.fusion import compute_in_one_loop, fast_compilation, fusion_barrier
+from jaxba.runtime.fusion import compute_in_one_loop, fast_compilation
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums_of, take_each
 from jaxba.typing import AnyArray
@@ -31,18 +31,12 @@ class Views(NamedTuple):
     def projected(self) -> camera.Projection:
         """The projections of the points.
 
-        Materialised under fast compilation, where each vector computed from them has a loop of its own.
-        """
+        Materialised under fast compilation, where each vector computed from them has a loop of its own."""
         projection = camera.project(self.frames, self.points, self.mask)
         return projection.stacked() if fast_compilation.value else projection
 
-    def materialized(self, rows: list[Array]) -> list[Array]:
-        """The same vectors, for several uses: computed once and stored under fast compilation, else unchanged."""
-        return list(fusion_barrier(jnp.stack(rows))) if fast_compilation.value else rows
 
-
-Terms = Callable[..., list[Array]]
-"""A function of `Views` and of further vectors over the same slots; it returns a list of vectors."""
+Terms = Callable[..., list[Array]]  # of `Views` and further vectors over the same slots
 
 
 def view_terms(

@@ -27,11 +27,8 @@ from jaxba.structure.agreement import ALONE
 from jaxba.structure.residual_slots import ResidualSlots, laid_out, residual_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
 
-CHECKED_INDICES = "jax_check_static_indices"
-"""A setting of JAX."""
-
-STEP, AGREE = 1e-6, 1e-3
-"""Relative step of central differences, and how near they have to be to derivatives, relative to the largest."""
+CHECKED_INDICES = "jax_check_static_indices"  # a setting of JAX
+STEP, AGREE = 1e-6, 1e-3  # of central differences, and how near to derivatives, both relative
 
 
 def with_residual(

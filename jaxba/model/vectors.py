@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Shaped
 
-CALLS, ELEMENTWISE = (
+CALLS, ELEMENTWISE = (  # primitives that hold a function, and that compute each number from those at its place
     frozenset(names.split())
     for names in (
         "jit pjit",
@@ -26,10 +26,8 @@ CALLS, ELEMENTWISE = (
         round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""",
     )
 )
-"""Primitives that hold a function, and that compute each number from those at its place."""
 
-Numbers = Shaped[np.ndarray, "..."]
-"""Vectors or scalars of JAX in an array of objects, of the shape of an array of one row."""
+Numbers = Shaped[np.ndarray, "..."]  # vectors or scalars of JAX in an array of objects, of the shape of one row's array
 
 
 def numbers_of(x: Array, rank: int) -> Numbers:
@@ -47,7 +45,7 @@ def _sliced(x: Numbers, start_indices: Any, limit_indices: Any, strides: Any) ->
     return x[tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))]
 
 
-MOVES: dict[str, Callable[..., Any]] = {
+MOVES: dict[str, Callable[..., Any]] = {  # primitives that only move numbers, in NumPy
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
     "reshape": lambda x, new_sizes, **_: x.reshape(new_sizes),
@@ -59,7 +57,6 @@ MOVES: dict[str, Callable[..., Any]] = {
     "transpose": lambda x, permutation: x.transpose(permutation),
     "unstack": lambda x, axis, **_: [np.squeeze(one, axis) for one in np.split(x, x.shape[axis], axis)],
 }
-"""Primitives that only move numbers, in NumPy."""
 
 
 class Traced:

@@ -48,9 +48,7 @@ OURS = Agent("agent")  # the paper's agent with what it takes to learn; the abla
 PRINTED = Agent("agent-printed", "paper")  # the paper's agent with the settings that it prints
 BEST = Agent("agent-guarded", "default")  # the best agent for lambda alone: scale-free observations, and the guard
 SECONDS = 5.5  # mean duration of an iteration, for a bonus of 10. Source: the paper on BAL, 110 s in 20 of classic
-
-BY_THE_CLOCK = ("game.reward=clock", f"game.scale={0.1 * SECONDS}", f"game.bonus={10 / SECONDS}")
-"""Minus the duration in seconds, and a bonus of 10, both times the preset's tenth."""
+BY_THE_CLOCK = ("game.reward=clock", f"game.scale={0.1 * SECONDS}", f"game.bonus={10 / SECONDS}")  # with a bonus of 10
 
 FEW = replace(OURS, name="agent-ten", few_scenes=True)
 REDUCTION = replace(OURS, name="agent-reduction", overrides=("game.reward=reduction",))

@@ -6,6 +6,7 @@ or a fraction (all solves succeed). The report states the rules (`criterion` in 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
@@ -17,11 +18,7 @@ Status = Literal["reproduced", "partly", "not", "not run"]
 
 RATIO_TOLERANCE = 1.25  # a ratio is reproduced if ours is the paper's up to this factor, either way
 PARTLY_RATIO = 0.9  # a ratio is partly reproduced if ours is at most this, a gain of at least a tenth, of another size
-
-FRACTION_TOLERANCE = 0.05
-"""A fraction is reproduced if ours differs from the paper's by at most this. Also the largest deficit in success of a
-method whose iterations or seconds are compared."""
-
+FRACTION_TOLERANCE = 0.05  # up to which fractions are alike; a larger deficit in success makes a gain none
 PARTLY_FRACTION_TOLERANCE = 0.15  # a fraction is partly reproduced if ours differs from the paper's by at most this
 
 
@@ -83,9 +80,7 @@ def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None, of:
     return Claim(text, f"{paper:.2f}", detail, status, near)
 
 
-def time_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
-    """The claim that `ours` takes the fraction `paper` of the seconds of `base`, by the rule of `ratio_claim`."""
-    return ratio_claim(text, paper, ours, base, "seconds")
+time_claim = functools.partial(ratio_claim, of="seconds")
 
 
 def longer_claim(text: str, paper: str, ours: Row | None, base: Row | None) -> Claim:

@@ -20,10 +20,7 @@ from jaxba.settings import to_yaml
 
 CLAIMS = "claims.md"  # file of the table of claims alone, in the folder of the run
 TAU = 0.001  # the smaller tolerance of the paper's figures
-
-INTERPRETATIONS = "interpretations.md"
-"""Section on the subjects on which the paper's text and its released code are open or contradict each other: what both
-say, and what is done here. Beside this module."""
+INTERPRETATIONS = "interpretations.md"  # what the paper and its released code leave open, and what is done here
 
 
 def write(runner: Runner, path: Path, command: str) -> list[Path]:

@@ -26,10 +26,7 @@ T = TypeVar("T")
 SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
 
 NEAR = 1e-3  # relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost
-
-GOOD_END = 1e-2
-"""Relative tolerance of `Row.good_ends`: the final cost is within this of the best known cost. A solver that converges
-to a worse cost needs few iterations without being better."""
+GOOD_END = 1e-2  # relative tolerance of `Row.good_ends`: a solver that ends higher needs few iterations
 
 
 @dataclass(frozen=True)
@@ -141,8 +138,7 @@ def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool
 
 def of_play(play: Play) -> list[Outcome]:
     """The outcomes on a set of scenes."""
-    cells = zip(play.iterations, play.converged, play.near, play.end, strict=True)
-    return [_outcome(iterations, converged, near, end) for iterations, converged, near, end in cells]
+    return [_outcome(*one) for one in zip(play.iterations, play.converged, play.near, play.end, strict=True)]
 
 
 def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Outcome]:

@@ -144,13 +144,12 @@ class Runner:
         return Method("zero-net", self._zero_net, self.config.agents.seeds)
 
     def _zero_net(self, seed: int, _: Any) -> Built:
-        agent = agents.train_config(self.config, agents.OURS).game.agent
-        path = self.folder / "agents" / f"zero-net-{seed}.npz"
+        settings = agents.train_config(self.config, agents.OURS)
+        agent, path = settings.game.agent, self.folder / "agents" / f"zero-net-{seed}.npz"
         if path.is_file():
             net = zero_net.restore(path, self.config.zero_net, agent)
         else:
             self.report(f"zero-net {seed + 1}: training")
-            settings = agents.train_config(self.config, agents.OURS)
             train_on = agents.scenes(self.config, self.folder, self.report)[0]
             game = agents.game(self.config, agents.OURS, settings, train_on)
             key = jax.random.fold_in(jax.random.key(self.config.seed), 2000 + seed)

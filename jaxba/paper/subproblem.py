@@ -26,9 +26,7 @@ def sub_problem(
     camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     keep = np.isin(camera_index, kept) & np.isin(point_index, allowed)
     pairs = np.unique(np.stack([point_index[keep], camera_index[keep]]), axis=1)
-    tracks = np.bincount(
-        pairs[0], minlength=problem.num_points
-    )  # counts distinct cameras, since a camera may observe a point twice
+    tracks = np.bincount(pairs[0], minlength=problem.num_points)  # of distinct cameras: one may observe a point twice
     keep &= tracks[point_index] >= MIN_TRACK
     if not keep.any():
         raise ProblemError(f"no point is seen by two of these {len(kept)} cameras")

@@ -36,9 +36,7 @@ from jaxba.runtime.jit import jit
 from jaxba.training import checkpoint
 from jaxba.typing import register_pytree
 
-MAX_SLOPE = 1.0
-"""Limit of the derivative of log10(cost) with respect to the action for each scene, so that one diverging step does not
-dominate a batch. A step with a non-finite cost counts as this limit, towards a larger lambda."""
+MAX_SLOPE = 1.0  # of log10(cost) by the action, for each scene; that of a step of non-finite cost is its negative
 
 _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
 
@@ -83,11 +81,8 @@ def initial_network(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> Ze
 def slope_of_next_cost(
     game: Game, episode: Episode, action: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Episode, StepInfo]:
-    """Makes one step, and differentiates its cost with respect to the action.
-
-    Returns: log10 of the candidate's cost over the current cost, its derivative with respect to the action, the episode
-        after the step, and the step. Rejected steps have these values too.
-    """
+    """Makes one step, rejected or not. Returns log10 of the candidate's cost over the current cost, its derivative by
+    the action, the episode after the step, and the step."""
 
     def play(action: Array) -> tuple[Array, tuple[Episode, StepInfo]]:
         after, step = game.iterate(game.kinds[0], game.banks[0], episode, action[None])

@@ -29,20 +29,14 @@ from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
 
-NEGLIGIBLE = 1e-6
-"""Relative predicted decrease below which there are no camera rounds or further trials. Source: Ceres."""
+NEGLIGIBLE = 1e-6  # relative predicted decrease below which are no camera rounds or further trials. Source: Ceres
 
 POINT_DECREASE = 1e-2
-"""Candidates after the full step stop their point iterations once one lowers the cost by less than this fraction of the
-predicted decrease. Not the full step: with the same rule there, `ceres+refine3` took 34 instead of 22 iterations to a
-relative error of 1e-3 on kitti00vo."""
+"""Candidates after the full step stop their point iterations once one lowers the cost by less than this part of the
+prediction. Not the full step: `ceres+refine3` would take 34 instead of 22 iterations to 1e-3 on kitti00vo."""
 
-NEAR_CONVERGENCE = 1e-3
-"""Predicted decrease, relative to the cost, below which points are refined from both of their starts, which doubles the
-time. Measured: in earlier iterations it brings nothing more."""
-
-COST_ROUNDING = 8.0
-"""Relative rounding error of a cost in machine epsilons: 1e-6 in float32, measured, and 2e-15 in float64."""
+NEAR_CONVERGENCE = 1e-3  # predicted decrease, relative to the cost, below which both starts of points are refined
+COST_ROUNDING = 8.0  # relative rounding error of a cost in machine epsilons: 1e-6 in float32, 2e-15 in float64
 
 
 class Step(NamedTuple):
@@ -60,8 +54,7 @@ class Step(NamedTuple):
         """Decrease of the cost that the linear model predicts for `fraction * d`, pixels^2.
 
         `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not negative, so that
-        nothing cancels.
-        """
+        nothing cancels."""
         return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
 
 
@@ -132,16 +125,9 @@ def assess(
     repairs: Int[Array, ""],
     full_step: Bool[Array, ""],
 ) -> Candidate:
-    """Refines the points of a candidate and decides whether it is accepted.
-
-    Args:
-        against: data of the step.
-        cameras: cameras of the candidate.
-        points: points before their embedded iterations.
-        step_fraction: it scales the predicted decrease.
-        repairs: camera rounds, trials and pattern moves until then, with this one.
-        full_step: whether this is the full step, after which points may also start from their rays.
-    """
+    """Refines the points of a candidate, given before their embedded iterations, and decides whether it is accepted.
+    `step_fraction` scales the predicted decrease. `repairs` are camera rounds, trials and pattern moves until then,
+    with this one. `full_step`: whether this is the full step, after which points may also start from their rays."""
     layout = against.layout
     predicted = against.step.predicted(step_fraction)
     points, terms = _refined(against, cameras, points, predicted, full_step)

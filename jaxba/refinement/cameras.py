@@ -17,8 +17,7 @@ from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
-DAMPINGS = (1e-6, 1e-2)
-"""Relative damping of the first attempt at a camera's step, and of a second one if the first did not lower its cost."""
+DAMPINGS = (1e-6, 1e-2)  # relative damping of the first attempt at a camera's step, and of one after a failure
 
 
 def refine_cameras(

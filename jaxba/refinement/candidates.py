@@ -35,31 +35,17 @@ from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.retraction import keep_focal_signs, move_cameras, step_between
 from jaxba.runtime import loops
 
-SHORTER = 0.25
-"""Factor on the length of a rejected step. Measured with 4 trials on Ladybug-49 with a constant lambda of 1e-6."""
-
-GOOD_GAIN = 0.5
-"""Gain ratio from which the linear model is trusted and there are no camera rounds."""
-
-MAX_COST_RATIO = 1.5
-"""Largest cost of a candidate, relative to the cost before the step, for camera rounds: outliers would pull cameras
-away. On Ladybug-49 with a constant lambda of 1e-6, a limit of 10 led to a minimum 19% above that reached with 1.5."""
-
-MIN_GAINS = (-5.0, -0.5)
-"""Smallest gain ratio after one camera round, and after more, for which there is another one. On six real problems none
-of the 12 and 17 candidates below was ever accepted."""
+SHORTER = 0.25  # factor on the length of a rejected step. Measured with 4 trials on Ladybug-49, lambda 1e-6
+GOOD_GAIN = 0.5  # gain ratio from which the linear model is trusted and there are no camera rounds
+MAX_COST_RATIO = 1.5  # of a candidate for camera rounds: a limit of 10 ended 19% higher on Ladybug-49, lambda 1e-6
+MIN_GAINS = (-5.0, -0.5)  # of a candidate after one camera round, and after more, for another: none below was accepted
 
 ROUNDS_OF_LATER_CANDIDATES = 1
-"""Most camera rounds of a backtracked candidate or a pattern move. Measured on 457 held-out scenes with an agent
-for such steps: 6.40 iterations to within 1e-4 of the best cost with none for backtracked candidates, 6.02 with one,
-5.88 with three; on real problems three took a tenth more work than one."""
+"""Most camera rounds of a backtracked candidate or a pattern move. On 457 scenes 6.40 iterations to 1e-4 with none for
+backtracked candidates, 6.02 with one, 5.88 with three; on real problems three took a tenth more work than one."""
 
-GAIN_TOLERANCE = 0.25
-"""Difference of the gain ratio from one up to which the linear model predicted the step."""
-
-SMALL_DAMPING_FRACTION = 0.1
-"""Damping fraction `d.D d / d.(H + D) d` up to which damping did not limit the length of a step. If the linear model
-predicted such a step, it is a Gauss-Newton step, and nothing is gained beyond it."""
+GAIN_TOLERANCE = 0.25  # difference of the gain ratio from one up to which the linear model predicted the step
+SMALL_DAMPING_FRACTION = 0.1  # up to which a step is a Gauss-Newton step, and nothing is gained beyond it
 
 
 class Search(NamedTuple):
@@ -80,8 +66,7 @@ class Search(NamedTuple):
 def best_candidate(against: Comparison) -> Candidate:
     """Evaluates a step: the candidate of the iteration, with the accept decision.
 
-    It is the first accepted candidate, possibly extended by pattern moves, or the last rejected one.
-    """
+    It is the first accepted candidate, possibly extended by pattern moves, or the last rejected one."""
     options = against.options
     start = first_search(against.cameras, against.previous.points, against.cost, against.step)
     start = jax.tree.map(jnp.asarray, start)

@@ -24,11 +24,8 @@ from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
-UNDISTORTIONS = 10
-"""Iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge."""
-
-FEW_UNDISTORTIONS = 3
-"""The same within an iteration of the solver, where it is done for every candidate."""
+UNDISTORTIONS = 10  # iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge.
+FEW_UNDISTORTIONS = 3  # the same within an iteration of the solver, where it is done for every candidate
 
 
 def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDISTORTIONS) -> Float[Array, "3 points"]:
@@ -75,8 +72,7 @@ def choose_starts(
     First the one of lower cost, or that has not diverged; then the other one, or the same if there is none.
 
     If the linear model sends a point behind its cameras, or so far away that its gradient vanishes, its own steps do
-    not bring it back; the midpoint of its rays does, unless it diverged itself (`PreviousPoints`).
-    """
+    not bring it back; the midpoint of its rays does, unless it diverged itself (`PreviousPoints`)."""
     middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
 
     def terms(views: Views, front: Array, *other: Array) -> list[Array]:
@@ -111,19 +107,8 @@ def refine_from_starts(
     min_decrease: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """`refine_points` from one or two starts, of which the result with the lower cost is returned. The cost of a point
-    has several minima along its rays. Which is the lowest shows only after a few iterations.
-
-    Args:
-        layout: the problem's observations.
-        cameras: cameras after the step.
-        frames: camera of every slot, of these.
-        points: points after the step.
-        loss: robust loss.
-        iterations: iterations per point and start.
-        previous: points before the step.
-        starts: 0: start from `points`; 1: from the likelier of these and the midpoints; 2: from both.
-        min_decrease: see `refine_points`.
-    """
+    has several minima along its rays. Which is the lowest shows only after a few iterations. Arguments as there, after
+    the step; `starts`: 0: from `points`; 1: from the likelier of these and the midpoints; 2: from both."""
     choose = lambda *given: choose_starts(layout, given[0], given[1], given[2], loss, given[3])
     given = cameras, frames, points, previous
     candidates = loops.run_if(starts > 0, choose, given, jnp.stack([points, points]))

@@ -37,23 +37,16 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums
 from jaxba.structure.sharing import Mask
 
-INITIAL_DAMPING = 1e-6
-"""Relative damping of a point's first step: Gauss-Newton except for parallel rays."""
-
-REJECTED_DAMPING = 1e-2
-"""Smallest relative damping after a point's step was rejected."""
-
-DAMPING_FACTOR = 10.0
-"""Factor on a point's damping after a rejected step, and its inverse after an accepted one."""
+INITIAL_DAMPING = 1e-6  # relative damping of a point's first step: Gauss-Newton except for parallel rays
+REJECTED_DAMPING = 1e-2  # smallest relative damping after a point's step was rejected
+DAMPING_FACTOR = 10.0  # factor on a point's damping after a rejected step, and its inverse after an accepted one
 
 MAX_DISTANCE_RATIO = 100.0
 """Largest growth of the distance of a point from its cameras by the step, and again by its own iterations. The distance
-is the harmonic mean of its depths, negative behind a camera; a point that starts behind its cameras has no limit.
-Chosen since the depths of a scene span two decades. With a ratio of 8 kitti00vo ended 3e-4 above the best known cost,
-with 100 it ended 2e-7 above."""
+is the harmonic mean of its depths, negative behind a camera; a point that starts behind its cameras has no limit. With
+a ratio of 8 kitti00vo ended 3e-4 above the best known cost, with 100 it ended 2e-7 above."""
 
-SMALL_DECREASE = 1e-2
-"""Largest decrease of an iteration, relative to the cost, after which the iterations may stop early."""
+SMALL_DECREASE = 1e-2  # largest decrease of an iteration, relative to the cost, after which they may stop early
 
 
 class PreviousPoints(NamedTuple):
@@ -184,6 +177,5 @@ def has_receded(inverse_depth_sum: Float[Array, " points"], before: Float[Array,
     """Whether points have moved behind their cameras or more than `MAX_DISTANCE_RATIO` times as far away.
 
     Both arguments are sums of inverse depths over a point's cameras, negative in front of them. A point that was behind
-    its cameras before has not receded, wherever it is.
-    """
+    its cameras before has not receded, wherever it is."""
     return (before < 0) & (MAX_DISTANCE_RATIO * inverse_depth_sum > before)

@@ -22,9 +22,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.rotations import left_jacobian
 from jaxba.structure.layout import Layout
 
-MAX_FOCAL_CHANGE = 0.3
-"""Relative change of a focal length beyond which k1 and k2 are added as they are: the fourth power of a first-order
-step is meaningless there. Measured: less gain with 0.1; no difference without a limit."""
+MAX_FOCAL_CHANGE = 0.3  # relative change of f beyond which k1, k2 are added as they are. With 0.1 less gain
 
 
 def move_cameras(
@@ -58,8 +56,7 @@ def keep_focal_signs(
     """Whether the focal length of each camera keeps its sign; false where it becomes zero.
 
     A mirrored image can fit for a while, and the iterations do not lead back; no file of cameras may hold one. A camera
-    that had no focal length may get any, and numbers that are not finite pass, since their cost is none.
-    """
+    that had no focal length may get any, and numbers that are not finite pass, since their cost is none."""
     return ~(jnp.sign(before[6]) * jnp.sign(after[6]) <= 0) | (before[6] == 0)
 
 

@@ -31,9 +31,7 @@ from jaxba.runtime.jit import Options, jit, quick_options, right_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, full once iterations pay for it."""
-
+Compilation = Literal["full", "quick", "auto"]  # optimised; hardly; hardly at first, fully once that pays
 Level = Literal["full", "quick"]  # how much one program is optimised
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"  # the option that switches XLA's newer kernel emitters off
 Kind = Literal["factorization", "iterative"]  # how a step solves its linear system
@@ -43,8 +41,7 @@ BREAK_EVEN: dict[Kind, int] = {"factorization": 1_200_000, "iterative": 1_000_00
 """Observations times iterations after which better programs have paid for their compilation, as
 `benchmarks.compilation` measures it. Those of a step are compiled side by side, and so take as long as the first."""
 
-TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}
-"""Iterations that a solve may well take: quick programs that would not last so long are left out."""
+TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}  # iterations that a solve may well take
 
 
 def quick_iterations(kind: Kind, observations: int) -> int:

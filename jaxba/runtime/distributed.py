@@ -30,9 +30,7 @@ PATIENCE_S = 5  # seconds after which a process says that it waits for others at
 HEARTBEAT_S = 30  # seconds of silence after which a process counts as dead and JAX ends the others; its default is 100
 WAIT_MS = 1 << 30  # twelve days, for which processes wait for the first one; Gloo's collectives wait half an hour
 THREADS = 8  # of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill
-
-LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")
-"""What JAX's errors say where another process is gone. They have no class of their own."""
+LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")  # in errors where a process is gone
 
 _done = itertools.count()
 

@@ -68,9 +68,7 @@ class ExecutableCache:
             leaves, tree = jax.tree.flatten(arguments)
             key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
             weak = lambda leaf: "weak" if getattr(leaf, "weak_type", False) else ""
-            typed = lambda leaf: (
-                f"{leaf.dtype}{leaf.shape}{weak(leaf)}" if hasattr(leaf, "dtype") else type(leaf).__name__
-            )
+            typed = lambda x: f"{x.dtype}{x.shape}{weak(x)}" if hasattr(x, "dtype") else type(x).__name__
             key += map(typed, leaves)
         except _UnknownSource:
             return None
@@ -217,11 +215,7 @@ def _describe(value: Any) -> str:
         return f"{_name(type(value))}{_describe(dict(fields))}"
     if isinstance(value, functools.partial):
         return _describe((value.func, *value.args))
-    if (
-        isinstance(value, types.FunctionType)
-        and "<" not in value.__qualname__
-        and value.__module__.startswith("jaxba.")
-    ):
+    if isinstance(value, types.FunctionType) and value.__module__.startswith("jaxba."):
         return _name(value)  # its source is part of the key
     raise _UnknownSource(repr(value))
 

@@ -42,7 +42,9 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         main_thread = threading.current_thread() is threading.main_thread()
-        ours = [number for number in SIGNALS if main_thread and self._replaces(signal.getsignal(number))]
+        unhandled = (signal.default_int_handler, signal.SIG_DFL)
+        replaces = lambda handler: handler in unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
+        ours = [number for number in SIGNALS if main_thread and replaces(signal.getsignal(number))]
         self._previous = {number: signal.signal(number, self._handle) for number in ours}
         self._previous_hook, sys.unraisablehook = sys.unraisablehook, self._raise_again if ours else sys.unraisablehook
         if not (ours and self.unit):
@@ -64,10 +66,6 @@ class Interrupt:
             self._sender.close()
             self._thread.join()
             self._receiver.close()
-
-    def _replaces(self, handler: Any) -> bool:
-        unhandled = handler in (signal.default_int_handler, signal.SIG_DFL)
-        return unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
 
     def _listen(self) -> None:
         """Runs in the thread: receives signals until the socket is closed."""

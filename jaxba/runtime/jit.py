@@ -16,12 +16,8 @@ from jax._src.core import trace_state_clean  # it has no public name
 
 Options = dict[str, bool | int | str]
 
-RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}
-"""Options that every program on a CPU is compiled with, as far as a jaxlib knows them: no fusions for YNNPACK."""
-
-
-QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""XLA's options for hardly optimised programs, as far as a jaxlib knows them: 0.12 has no older emitters."""
+RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}  # of all programs on a CPU: no fusions for YNNPACK
+QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}  # 0.12 lacks the latter
 
 
 @functools.cache

@@ -33,10 +33,7 @@ def fori_loop(
     first: int | Int[Array, ""], end: int | Int[AnyArray, ""], body: Callable[[Any, Carry], Carry], start: Carry
 ) -> Carry:
     """`jax.lax.fori_loop`, never taken for a small loop."""
-
-    def advance(loop: tuple[Array, Carry]) -> tuple[Array, Carry]:
-        return _next(loop[0]), body(loop[0], loop[1])
-
+    advance = lambda loop: (_next(loop[0]), body(loop[0], loop[1]))
     begin = jnp.asarray(first, jnp.int32)
     return lax.while_loop(lambda loop: loop[0] < end, advance, (begin, start))[1]
 
@@ -67,9 +64,8 @@ def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[AnyArray, ""] 
     results = jax.tree.map(lambda one: jnp.zeros((count, *one.shape), one.dtype), jax.eval_shape(function, at(0)))
 
     def body(k: Array, results: Any) -> Any:
-        return jax.tree.map(
-            lambda all_, one: lax.dynamic_update_index_in_dim(all_, one, k, 0), results, function(at(k))
-        )
+        put = lambda all_, one: lax.dynamic_update_index_in_dim(all_, one, k, 0)
+        return jax.tree.map(put, results, function(at(k)))
 
     return fori_loop(0, used, body, results)
 

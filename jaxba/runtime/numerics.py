@@ -15,11 +15,10 @@ from jaxba.runtime.process import refuse_fork, single_blas_thread
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-TRACED = (
+TRACED = (  # what is said where JAX traces a function that needs NumPy arrays
     "JAX traces this call (jit, vmap or grad), which is for NumPy problems outside of traces: in jit and vmap use "
     "jaxba.solve_loop with what jaxba.prepare returned before, for gradients jaxba.differentiable_solve"
 )
-"""What is said where JAX traces a function that needs NumPy arrays."""
 
 
 @contextmanager

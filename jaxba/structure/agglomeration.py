@@ -7,11 +7,8 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-MAX_DENSE_ENTRIES = 1 << 20
-"""Cameras times points up to which common points are counted by a sparse-dense product, which takes half the time."""
-
-MAX_PRODUCTS = 2e7
-"""Most pairs of observations that are counted to find common points; a second's work."""
+MAX_DENSE_ENTRIES = 1 << 20  # cameras times points up to which a sparse-dense product counts in half the time
+MAX_PRODUCTS = 2e7  # most pairs of observations that are counted to find common points; a second's work
 
 
 def shared_points(

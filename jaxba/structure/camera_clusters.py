@@ -21,13 +21,8 @@ from jaxba.structure.track_buckets import Slots
 from jaxba.structure.unknowns import Unknowns
 from jaxba.typing import AnyArray, register_pytree
 
-CLUSTER_CAMERAS = 8
-"""Cameras per cluster, unless that makes more than `MAX_CLUSTERS`. Measured on real problems: as many conjugate
-gradient iterations as with 4, and down to half of those with 16."""
-
-MAX_CLUSTERS = 128
-"""At most 1280 coarse unknowns. Factoring these costs as much as two or three products with a system of that many
-clusters."""
+CLUSTER_CAMERAS = 8  # or more, for at most `MAX_CLUSTERS`: as many iterations as with 4, down to half of those with 16
+MAX_CLUSTERS = 128  # at most 1280 coarse unknowns: factoring them costs two or three products with such a system
 
 
 @register_pytree
@@ -35,23 +30,12 @@ clusters."""
 class ClusterLayout:
     """The cluster of each camera, and the index arrays that form the coarse system."""
 
-    label: Int[AnyArray, " cameras"]
-    """Cluster of each camera."""
-
-    members: Int[AnyArray, "clusters size"]
-    """Cameras of a cluster; the number of cameras in the padding."""
-
-    levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree from slots to coarse slots, of which the last is empty."""
-
-    point: Int[AnyArray, " coarse"]
-    """Point of each coarse slot, in layout order; arbitrary for the empty one."""
-
-    pairs: PairLayout
-    """Pairs of coarse slots of one point, which form the blocks of the coarse system."""
-
-    ties: tuple[Sharing, ...]
-    """Clusters that have unknowns in common, for each of `Unknowns.parts`: their changes of these are one."""
+    label: Int[AnyArray, " cameras"]  # cluster of each camera
+    members: Int[AnyArray, "clusters size"]  # cameras of a cluster; the number of cameras in the padding
+    levels: tuple[Int[AnyArray, "_ _"], ...]  # summation tree from slots to coarse slots, of which the last is empty
+    point: Int[AnyArray, " coarse"]  # point of each coarse slot, in layout order; arbitrary for the empty one
+    pairs: PairLayout  # pairs of coarse slots of one point, which form the blocks of the coarse system
+    ties: tuple[Sharing, ...]  # clusters that have unknowns in common, for each of `Unknowns.parts`; they change as one
 
 
 def cluster_layout(

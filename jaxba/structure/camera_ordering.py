@@ -13,15 +13,9 @@ from jaxtyping import Bool, Int
 
 from jaxba.typing import AnyArray, register_pytree
 
-MAX_BAND_FRACTION = 1 / 3
-"""Largest `b / n` for which a system of n cameras is factored as a band of b. Both factorisations were measured at
-47 GFLOP/s on two cores, so that they break even at 1 / sqrt(6) = 0.41; the rest is overhead."""
-
-MIN_BAND_CAMERAS = 64
-"""Smaller systems are factored dense, which takes one or two milliseconds."""
-
-TILE_CAMERAS = 11
-"""Cameras per tile. Measured: the same time from 4 to 11; larger tiles waste operations at the edge of the band."""
+MAX_BAND_FRACTION = 1 / 3  # most `b / n` for a band of b; as fast as dense at 0.41 without overhead
+MIN_BAND_CAMERAS = 64  # smaller systems are factored dense, which takes one or two milliseconds
+TILE_CAMERAS = 11  # cameras per tile. The same time from 4 to 11; larger tiles waste operations at the band's edge
 
 
 @register_pytree
@@ -29,14 +23,9 @@ TILE_CAMERAS = 11
 class Band:
     """The reduced camera system in tiles of `m` cameras; a row of tiles ends with the one on the diagonal."""
 
-    blocks: Int[AnyArray, "tiles m columns"]
-    """Index of the block of (camera of the tile row, camera of the row's tiles); the zero block where there is none."""
-
-    camera: Int[AnyArray, "tiles m"]
-    """Camera at each position of the ordering; the number of cameras in the padding."""
-
-    rank: Int[AnyArray, " cameras"]
-    """Position of each camera in the ordering, counted through all tiles."""
+    blocks: Int[AnyArray, "tiles m columns"]  # block of (camera of the tile row, of the row's tiles); zero if none
+    camera: Int[AnyArray, "tiles m"]  # camera at each position of the ordering; the number of cameras in the padding
+    rank: Int[AnyArray, " cameras"]  # position of each camera in the ordering, counted through all tiles
 
 
 def camera_order(
@@ -60,8 +49,7 @@ def reverse_cuthill_mckee(linked: Bool[np.ndarray, "nodes nodes"]) -> Int[np.nda
     """The nodes of a symmetric graph in the reverse Cuthill-McKee ordering.
 
     A breadth-first search from a node of least degree, which takes the new neighbours of a node by increasing degree;
-    reversed. The same order as SciPy's, whose import takes longer than this for a thousand cameras.
-    """
+    reversed. The same order as SciPy's, whose import takes longer than this for a thousand cameras."""
     degree = (linked.sum(axis=1) + linked.diagonal()).astype(np.int32)
     order, found, waiting = np.empty(len(linked), np.int64), 0, np.ones(len(linked), bool)
     for seed in np.argsort(degree):

@@ -17,18 +17,14 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import MAX_CAMERAS, MAX_OBSERVATIONS, MAX_PAIRS, Capacity, slots_for
 
-ROUNDED = np.array([1, 16, 64, 256])
-"""Sizes of cells are multiples of these, so that later problems fit."""
+ROUNDED = np.array([1, 16, 64, 256])  # sizes of cells are multiples of these, so that later problems fit
 
 FIXED_S, CUBE_S, EACH_S = 5e-5, 2.5e-11, np.array([1e-5, 7e-7, 2.7e-7, 6e-9])
 """Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that is padding, on
 windows of 5 to 20 cameras, x86-64 with AVX-512. The work for the pairs that there are is the same in every cell."""
 
-ITERATIONS = 20
-"""Iterations of a solve, as far as that matters for the number of cells."""
-
-COMPILE_S = 8.0
-"""Seconds in which one core traces and compiles the program of a cell."""
+ITERATIONS = 20  # iterations of a solve, as far as that matters for the number of cells
+COMPILE_S = 8.0  # seconds in which one core traces and compiles the program of a cell
 
 
 class Sizes(NamedTuple):
@@ -103,8 +99,7 @@ def _cells_of_kind(seen: Sequence[Sizes], times: float) -> list[Sizes]:
     return [Sizes._make([*cell.tolist(), seen[0].exactly]) for cell in cells]
 
 
-NO_CELL = Sizes(0, 0, 0, 0, 0)
-"""Of problems that fit none."""
+NO_CELL = Sizes(0, 0, 0, 0, 0)  # of problems that fit none
 
 
 def cell_for(sizes: Sizes, cells: Sequence[Sizes]) -> Sizes:

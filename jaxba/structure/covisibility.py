@@ -18,15 +18,9 @@ from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
-PAIR_CHUNKS = (4, 8)
-"""Candidate chunk widths: pairs of one block that are multiplied and summed together."""
-
-PAIR_BATCH = 2048
-"""Most chunks per batch. It bounds the gathered operands to 7 MB and the products to 1.3 MB, so that they stay in the
-cache."""
-
-PAIR_ITEM_COST = 1.5
-"""Cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width."""
+PAIR_CHUNKS = (4, 8)  # candidate chunk widths: pairs of one block that are multiplied and summed together
+PAIR_BATCH = 2048  # most chunks per batch: gathered operands of 7 MB and products of 1.3 MB stay in the cache
+PAIR_ITEM_COST = 1.5  # cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width
 
 
 @register_pytree
@@ -34,43 +28,24 @@ PAIR_ITEM_COST = 1.5
 class PairLayout:
     """The pairs of observations of each block of the reduced camera system, lower triangle."""
 
-    left: Int[AnyArray, "batches chunks width"]
-    """Camera-sorted index of the observation by the camera of the block's rows."""
-
-    right: Int[AnyArray, "batches chunks width"]
-    """Camera-sorted index of the observation of the same point by the camera of the block's columns."""
-
+    left: Int[AnyArray, "batches chunks width"]  # camera-sorted index of the observation by the camera of the rows
+    right: Int[AnyArray, "batches chunks width"]  # the same of the same point by the camera of the block's columns
+    # chunks of a batch that belong to one block and are summed together. The last row of a batch is padding.
     sums: Int[AnyArray, "batches partial width_of_sums"]
-    """Chunks of a batch that belong to one block and are summed together. The last row of a batch is padding."""
-
+    # summation tree from the partial sums of all batches to blocks; the last block is always zero. With fixed capacity
+    # instead the ranks of partial sums that are added (`sum_trees.prefix_levels`), and blocks are sorted by their
+    # number of partial sums.
     levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree from the partial sums of all batches to blocks; the last block is always zero. With fixed capacity
-    instead the ranks of partial sums that are added (`sum_trees.prefix_levels`), and blocks are sorted by their number
-    of partial sums."""
-
-    used: Int[AnyArray, ""] | None
-    """Number of batches that hold pairs, with fixed capacity; None for all."""
-
-    block_camera: Int[AnyArray, " blocks"]
-    """Camera of each diagonal block; the number of cameras for other blocks."""
-
-    block_row: Int[AnyArray, " blocks"]
-    """Camera of the rows of each block."""
-
-    block_column: Int[AnyArray, " blocks"]
-    """Camera of the columns of each block."""
-
+    used: Int[AnyArray, ""] | None  # number of batches that hold pairs, with fixed capacity; None for all
+    block_camera: Int[AnyArray, " blocks"]  # camera of each diagonal block; the number of cameras for other blocks
+    block_row: Int[AnyArray, " blocks"]  # camera of the rows of each block
+    block_column: Int[AnyArray, " blocks"]  # camera of the columns of each block
+    # summation tree to cameras of `S x`: from the products of blocks, followed by those of transposed blocks
     product_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree to cameras of `S x`: from the products of blocks, followed by those of transposed blocks."""
-
-    diagonal: Int[AnyArray, " cameras"]
-    """Index of the diagonal block of each camera."""
-
+    diagonal: Int[AnyArray, " cameras"]  # index of the diagonal block of each camera
+    # index of the block of (row, column) in the lower triangle, else of the zero block; for a dense factorisation
     table: Int[AnyArray, "cameras cameras"] | None
-    """Index of the block of (row, column) in the lower triangle, else of the zero block; for a dense factorisation."""
-
-    band: Band | None
-    """For a band factorisation instead; None if the system is not factored as a band."""
+    band: Band | None  # for a band factorisation instead; None if the system is not factored as a band
 
 
 def pair_layout(
@@ -88,19 +63,11 @@ def pair_layout(
 ) -> PairLayout:
     """Lists all pairs of observations of one point, sorted by the block that they add to.
 
-    Args:
-        camera: camera of each observation; observations are sorted by point.
-        row_index: row of each observation among those that are multiplied (its camera-sorted index).
-        tracks: number of observations of each point.
-        start: position of the first observation of each point.
-        cameras: number of cameras.
-        empty: index of a row of zeros.
-        factor: whether the system will be factored.
-        banded: whether it may be factored as a band, where that is cheaper.
-        capacity: fixed sizes from which all shapes follow: every block of the lower triangle is listed, and no band is
-            used.
-        agreement: with the other shards of a problem, which have the same blocks.
-    """
+    Observations are sorted by point; each has its `camera` and its row among those that are multiplied (its
+    camera-sorted index). Of each point there are the number of observations (`tracks`) and the position of the first.
+    `empty` is the index of a row of zeros. `factor`: whether the system will be factored; `banded`: whether as a band,
+    where that is cheaper. With a `capacity` all shapes follow from that: every block of the lower triangle is listed,
+    and no band is used. The other shards of a problem (`agreement`) have the same blocks."""
     camera, row_index = camera.astype(np.int32), row_index.astype(np.int32)
     left, right = _pairs_of_tracks(tracks, start)
     rows, columns = camera[left], camera[right]
@@ -233,15 +200,8 @@ def _batch_sums(
     loosest: bool = False,
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
     """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
-
-    Args:
-        chunks: number of chunks of each block; those of one block are contiguous.
-        batches: number of batches.
-        batch: number of chunks of a batch.
-        most: largest number of chunks of a block, if all shapes shall follow from that and from the numbers above.
-        agreement: with the other shards of a problem.
-        loosest: whether there is room for the worst case.
-    """
+    `chunks` are numbers of chunks of blocks, which are contiguous, `batch` is that of a batch, `most` the largest of a
+    block, if all shapes shall follow from these; `loosest`: whether there is room for the worst case."""
     block = np.repeat(np.arange(len(chunks)), chunks)
     own_batch, position = np.divmod(np.arange(len(block)), batch)
     is_start = (np.diff(block, prepend=-1) != 0) | (position == 0)  # first chunk of a block within a batch
@@ -280,8 +240,7 @@ def _sorted_by_block(
 ) -> tuple[Int[np.ndarray, " blocks"], Int[np.ndarray, " blocks"], Int[np.ndarray, " pairs"]]:
     """Keys `row * cameras + column` of non-zero blocks, sorted, their numbers of pairs, and pairs sorted by block.
 
-    Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable.
-    """
+    Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable."""
     listed = np.append(listed, np.arange(cameras, dtype=np.int64) * (cameras + 1))
     pair_keys = rows.astype(np.int64) * cameras + columns
     order = sorted_by(pair_keys, cameras**2)

@@ -8,17 +8,9 @@ from __future__ import annotations
 
 from jaxba.structure.observation_order import ObservationOrder
 
-MIN_DENSITY = 0.1
-"""Smallest number of pairs, per point and cameras squared, for which a dense matrix product is cheaper. Measured: it is
-17 times as fast per operation as products of listed pairs, and computes each of them twice."""
-
-DENSE_UNKNOWNS = 512
-"""Largest system that is formed by a dense product; the operand takes 72 bytes per point and camera unknown. Also the
-largest capacitance matrix of Woodbury's identity, which LAPACK factors in a millisecond."""
-
-MAX_POINT_RATIO = 2 / 3
-"""Point coordinates over camera unknowns up to which Woodbury's identity is used. Measured break-even: 0.7 for single
-problems of 10 and 40 cameras, 0.85 for batches of 256 scenes."""
+MIN_DENSITY = 0.1  # least pairs, per point and cameras squared, for a dense product: 17 times as fast per operation
+DENSE_UNKNOWNS = 512  # largest system formed by a dense product, and largest capacitance matrix of Woodbury's identity
+MAX_POINT_RATIO = 2 / 3  # most point coordinates per camera unknown for Woodbury's identity: 0.7 alone, 0.85 in batches
 
 
 def has_few_points(points: int, cameras: int) -> bool:

@@ -14,8 +14,7 @@ from jax import Array, lax
 
 from jaxba.structure.layout import Layout
 
-AXIS = "devices"
-"""Name of the axis of the mesh over which points are divided."""
+AXIS = "devices"  # name of the axis of the mesh over which points are divided
 
 T = TypeVar("T")
 

@@ -3,12 +3,8 @@
 An *observation slot*, slot for short, is a position in the arrays over observations; it holds one observation or is
 empty. Points with similar numbers of observations form a bucket; in a bucket, `n` points with up to `t` observations
 each own a tile of `t x n` slots, so that the sum over the observations of a point is a dense sum over `t`
-(structure/track_buckets.py).
-
-Sums over a camera, or over a block of the reduced camera system, are *summation trees* (structure/sum_trees.py): rows
-are gathered in chunks of fixed width that belong to one target and summed densely, then the partial sums in the same
-way, until there is one row per target. There are no scatter operations. Padding of the index arrays refers to an empty
-slot, whose values are exactly zero.
+(structure/track_buckets.py). Sums over a camera, or over a block of the reduced camera system, are *summation trees*
+(structure/sum_trees.py). Padding of the index arrays refers to an empty slot, whose values are exactly zero.
 
 The rows of the first level of the camera tree list the slots sorted by camera. The position of a slot in this list is
 its *camera-sorted index*.
@@ -47,8 +43,7 @@ from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-CAMERA_CHUNK = 8
-"""Observations per chunk of a camera. Their products are unrolled, so this number decides the size of the program."""
+CAMERA_CHUNK = 8  # observations per chunk of a camera. Their products are unrolled: it decides the program's size
 
 
 @register_pytree
@@ -56,62 +51,31 @@ CAMERA_CHUNK = 8
 class Layout(ArrayRecord):
     """A problem's observations in slot order, with the index arrays of their sums. Its points are in *layout order*."""
 
-    slot_camera: Int[AnyArray, " slots"]
-    """Camera of each slot."""
-
-    slot_point: Int[AnyArray, " slots"]
-    """Point of each slot, in layout order."""
-
-    slot_mask: Bool[AnyArray, " slots"]
-    """Whether the slot holds an observation with pixels."""
-
-    observation: Int[AnyArray, " slots"]
-    """Index in the problem of the observation of each slot; out of range in empty slots."""
-
-    pixels: Float[AnyArray, "2 slots"]
-    """Measured pixels; zero in empty slots."""
-
-    whitening: Float[AnyArray, "2 2 slots"] | None
-    """`Sigma^(-1/2)` of each observation."""
-
-    points: Int[AnyArray, " points"]
-    """Index in the problem of each point in layout order; padding points have an index out of range."""
-
+    slot_camera: Int[AnyArray, " slots"]  # camera of each slot
+    slot_point: Int[AnyArray, " slots"]  # point of each slot, in layout order
+    slot_mask: Bool[AnyArray, " slots"]  # whether the slot holds an observation with pixels
+    observation: Int[AnyArray, " slots"]  # index in the problem of the observation of each slot; out of range if empty
+    pixels: Float[AnyArray, "2 slots"]  # measured pixels; zero in empty slots
+    whitening: Float[AnyArray, "2 2 slots"] | None  # `Sigma^(-1/2)` of each observation
+    points: Int[AnyArray, " points"]  # index in the problem of each point in layout order; out of range for padding
+    # in a layout with fixed capacity the ranks of chunks that are added to the first one of each point
+    # (`sum_trees.prefix_levels`); None for buckets
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
-    """In a layout with fixed capacity the ranks of chunks that are added to the first one of each point
-    (`sum_trees.prefix_levels`); None for buckets."""
-
+    # summation tree from slots to cameras. The flattened first level sorts the slots by camera and contains an empty
+    # one.
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree from slots to cameras. The flattened first level sorts the slots by camera and contains an empty
-    one."""
-
-    camera_seen: Bool[AnyArray, " cameras"]
-    """Cameras with at least one observation; the others are not optimised."""
-
-    pairs: PairLayout | None
-    """Pairs of observations that form the reduced camera system; None if it is not formed from them."""
-
+    camera_seen: Bool[AnyArray, " cameras"]  # cameras with at least one observation; the others are not optimised
+    pairs: PairLayout | None  # that form the reduced camera system; None if it is not formed from them
+    # slot of the observation of each point by each camera, an empty slot if there is none. Only where the reduced
+    # camera system is formed as one dense matrix product.
     grid: Int[AnyArray, "points cameras"] | None
-    """Slot of the observation of each point by each camera, an empty slot if there is none. Only where the reduced
-    camera system is formed as one dense matrix product."""
-
-    clusters: ClusterLayout | None
-    """Clusters of the two-level preconditioner; None if it is not used."""
-
-    partitions: Partition | None
-    """Random partitions of the cameras, along a leading axis; None if no method uses them."""
-
-    unknowns: Unknowns
-    """Camera models, and what is shared or constant."""
-
-    residuals: tuple[ResidualSlots, ...]
-    """Residuals of one's own, and the slots that their rows have."""
-
-    buckets: tuple[Bucket, ...] = field(metadata={"static": True})
-    """Shape of each bucket; empty for a layout with fixed capacity."""
-
+    clusters: ClusterLayout | None  # clusters of the two-level preconditioner; None if it is not used
+    partitions: Partition | None  # random ones of the cameras, along a leading axis; None if no method uses them
+    unknowns: Unknowns  # camera models, and what is shared or constant
+    residuals: tuple[ResidualSlots, ...]  # of one's own, and the slots that their rows have
+    buckets: tuple[Bucket, ...] = field(metadata={"static": True})  # shape of each bucket; none with fixed capacity
+    # axis of the mesh over which points are divided (structure/devices.py); none: all are here
     axes: tuple[str, ...] = field(default=(), metadata={"static": True})
-    """Axis of the mesh over which points are divided (structure/devices.py); none: all are here."""
 
     @property
     def num_slots(self) -> int:

@@ -20,11 +20,8 @@ from scipy.sparse import csr_matrix
 
 from jaxba.structure.agglomeration import shared_points
 
-TEMPERATURE = 10.0
-"""Inverse temperature of the softmax; larger is greedier. Source: the authors' code."""
-
-MAX_PASSES = 30
-"""Most passes of one clustering. Each about halves the number of communities; 5 to 8 are usual."""
+TEMPERATURE = 10.0  # inverse temperature of the softmax; larger is greedier. Source: the authors' code.
+MAX_PASSES = 30  # most passes of one clustering. Each about halves the number of communities; 5 to 8 are usual.
 
 
 def camera_graph(
@@ -32,8 +29,7 @@ def camera_graph(
 ) -> csr_matrix:
     """Edge weights `|P_i and P_j| / |P_i or P_j|` for the sets P_i of points that camera i sees, [cameras, cameras].
 
-    For a large problem they are estimated from a sample of the points (`agglomeration.shared_points`).
-    """
+    For a large problem they are estimated from a sample of the points (`agglomeration.shared_points`)."""
     shared, seen = shared_points(camera, point, cameras, points)
     edges = shared.tocoo()
     weight = edges.data / (seen[edges.row] + seen[edges.col] - edges.data)
@@ -97,8 +93,7 @@ def _pass(
 ) -> np.ndarray:
     """One pass: the community that every node joins, as the index of the node that founded it.
 
-    Nodes choose by the gain in modularity: the weight of the edge minus its expectation from the degrees.
-    """
+    Nodes choose by the gain in modularity: the weight of the edge minus its expectation from the degrees."""
     nodes = len(size)
     row, column = np.repeat(np.arange(nodes), np.diff(weight.indptr)), weight.indices
     gain = sharpness * (weight.data - degree[column] * degree[row] / total)

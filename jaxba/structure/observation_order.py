@@ -16,20 +16,11 @@ from jaxba.structure.sum_trees import sorted_by
 class ObservationOrder:
     """The observations of a problem, sorted by point, then by camera."""
 
-    order: Int[np.ndarray, " observations"]
-    """Index in the problem of each sorted observation."""
-
-    camera: Int[np.ndarray, " observations"]
-    """Camera of each sorted observation."""
-
-    point: Int[np.ndarray, " observations"]
-    """Point of each sorted observation."""
-
-    tracks: Int[np.ndarray, " points"]
-    """Number of observations of each point."""
-
-    num_cameras: int
-    """Number of cameras, observed or not."""
+    order: Int[np.ndarray, " observations"]  # index in the problem of each sorted observation
+    camera: Int[np.ndarray, " observations"]  # camera of each sorted observation
+    point: Int[np.ndarray, " observations"]  # point of each sorted observation
+    tracks: Int[np.ndarray, " points"]  # number of observations of each point
+    num_cameras: int  # number of cameras, observed or not
 
     @classmethod
     def of(cls, problem: BundleProblem) -> ObservationOrder:

@@ -23,33 +23,14 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
-CAMERAS = (8, 12, 16, 20, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128)
-"""Sizes in cameras. A dense system of 128 cameras, 1152 unknowns, takes 8 ms to factor; longer sequences are better
-factored as bands."""
-
-POINT_CHUNK = 2
-"""Slots per chunk: each point has as many chunks as its observations need. Measured on five real problems: 6 to 14% of
-the slots of such chunks are empty; with three it is 11 to 28%."""
-
-MIN_OBSERVATIONS = 1024
-"""Smallest number of slots. Measured on Ladybug-49: a step takes 0.2 us per slot, so that this many cost no time."""
-
-POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)
-"""Points per chunk in the capacity, as few as suffice. Real problems have 0.2 to 0.6, and every point has a chunk. A
-padding point without slots costs little."""
-
-PAIRS_PER_SLOT = 6
-"""Pairs per slot in the capacity, or 2, 4, ... times as many. Windows of the KITTI sequence kitti00vo have 2.9 to 4.2.
-Only those batches of pairs are multiplied that hold some, so that spare pairs cost little."""
-
-MAX_CAMERAS = CAMERAS[-1]
-"""Most cameras of a padded problem."""
-
-MAX_OBSERVATIONS = 1 << 17
-"""Most slots of a padded problem. Measured on Ladybug-49: a step takes 0.4 us per slot, twenty steps take a second."""
-
-MAX_PAIRS = 1 << 20
-"""Most pairs of a padded problem. Measured: a step takes 0.1 us per pair, twenty steps take two seconds."""
+CAMERAS = (8, 12, 16, 20, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128)  # longer sequences are better factored as bands
+POINT_CHUNK = 2  # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
+MIN_OBSERVATIONS = 1024  # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
+POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)  # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
+PAIRS_PER_SLOT = 6  # or 2, 4, ... times as many. Windows of kitti00vo have 2.9 to 4.2; spare pairs cost little
+MAX_CAMERAS = CAMERAS[-1]  # most cameras of a padded problem
+MAX_OBSERVATIONS = 1 << 17  # most slots of a padded problem. On Ladybug-49 a step takes 0.4 us per slot
+MAX_PAIRS = 1 << 20  # most pairs of a padded problem. Measured: 0.1 us per pair and step, twenty steps take two seconds
 
 
 @dataclass(frozen=True)
@@ -58,15 +39,11 @@ class Capacity:
 
     cameras: int
     points: int
-    observations: int
-    """Number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty."""
-
-    pairs: int
-    """Number of pairs of observations of one point, an observation with itself included."""
-
+    observations: int  # number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty
+    pairs: int  # number of pairs of observations of one point, an observation with itself included
+    # whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a point
+    # twice. Else they are smaller where the problem is a usual one.
     fixed: bool = False
-    """Whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a
-    point twice. Else they are smaller where the problem is a usual one."""
 
     def holds(self, observations: ObservationOrder) -> bool:
         """Whether the problem fits; its pairs are not counted."""
@@ -100,7 +77,9 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
     pairs = observations.num_listed_pairs
     if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
         return None
-    slots = _eighth_octave(max(MIN_OBSERVATIONS, needed))
+    wanted = max(MIN_OBSERVATIONS, needed)
+    step = _power(wanted) // 16  # slots are 8, 9, ..., 15 times a power of two
+    slots = -(-wanted // step) * step
     chunks = slots // POINT_CHUNK
     return Capacity(
         cameras=next(size for size in CAMERAS if size >= cameras),
@@ -113,8 +92,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
 def slots_for(tracks: Int[np.ndarray, " points"]) -> int:
     """Number of slots that points with these numbers of observations need.
 
-    A point without observations gets a chunk, too, and one more is always empty.
-    """
+    A point without observations gets a chunk, too, and one more is always empty."""
     return POINT_CHUNK * (1 + int(np.sum(np.maximum(1, -(-tracks // POINT_CHUNK)))))
 
 
@@ -138,9 +116,3 @@ def padded_parameters(
 def _power(count: int) -> int:
     """The power of two at or above a count."""
     return 1 << max(0, count - 1).bit_length()
-
-
-def _eighth_octave(count: int) -> int:
-    """The smallest product of 8, 9, ..., 15 and a power of two at or above a count of at least 16."""
-    step = _power(count) // 16
-    return -(-count // step) * step

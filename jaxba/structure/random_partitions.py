@@ -25,11 +25,8 @@ from jaxba.structure.sum_trees import TREE_WIDTH, Room, sum_tree
 from jaxba.structure.track_buckets import Slots
 from jaxba.typing import AnyArray, register_pytree
 
-PARTITIONS = 16
-"""Number of partitions of a problem, used cyclically."""
-
-SEED = 0
-"""Seed of the clusterings; the same problem always gets the same ones."""
+PARTITIONS = 16  # number of partitions of a problem, used cyclically
+SEED = 0  # seed of the clusterings; the same problem always gets the same ones
 
 
 @register_pytree
@@ -37,21 +34,13 @@ SEED = 0
 class Partition:
     """One partition of the cameras, or several along a leading axis."""
 
-    label: Int[AnyArray, "*t cameras"]
-    """Cluster of each camera."""
-
-    members: Int[AnyArray, "*t clusters size"]
-    """Cameras of each cluster, in order; padded with the number of cameras."""
-
+    label: Int[AnyArray, "*t cameras"]  # cluster of each camera
+    members: Int[AnyArray, "*t clusters size"]  # cameras of each cluster, in order; padded with the number of cameras
+    # index in `PairLayout` of the block of two members, lower triangle; else that of the zero block, and one past it on
+    # the diagonal of the padding
     blocks: Int[AnyArray, "*t clusters size size"]
-    """Index in `PairLayout` of the block of two members, lower triangle; else that of the zero block, and one past it
-    on the diagonal of the padding."""
-
-    slot_replica: Int[AnyArray, "*t slots"]
-    """Point replica of each slot; empty slots belong to the last replica, which has no observations."""
-
-    levels: tuple[Int[AnyArray, "*t _ _"], ...]
-    """Summation tree from slots to point replicas."""
+    slot_replica: Int[AnyArray, "*t slots"]  # point replica of each slot; the last, without observations, of empty ones
+    levels: tuple[Int[AnyArray, "*t _ _"], ...]  # summation tree from slots to point replicas
 
     def at(self, iteration: int | Int[Array, ""]) -> Partition:
         """The partition of an iteration, counted from 0."""

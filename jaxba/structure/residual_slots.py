@@ -28,8 +28,7 @@ from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.structure.agreement import Agreement
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-NOWHERE = 2**30
-"""A slot out of range."""
+NOWHERE = 2**30  # a slot out of range
 
 
 @register_pytree
@@ -37,22 +36,15 @@ NOWHERE = 2**30
 class ResidualSlots(ArrayRecord):
     """Rows of one residual in a layout."""
 
-    rows: Rows
-    """The function and its data."""
-
-    cameras: tuple[Int[AnyArray, " rows"], ...]
-    """One or two cameras of each row."""
-
-    points: tuple[Int[AnyArray, " rows"], ...]
-    """One or two points of each row, in layout order; any if the function takes none."""
-
+    rows: Rows  # the function and its data
+    cameras: tuple[Int[AnyArray, " rows"], ...]  # one or two cameras of each row
+    points: tuple[Int[AnyArray, " rows"], ...]  # one or two points of each row, in layout order; any if it takes none
+    # slots of each row: of each pair of numbers, and each of its one or two cameras or points; out of range where there
+    # is none
     slots: Int[AnyArray, "pairs ends rows"]
-    """Slots of each row: of each pair of numbers, and each of its one or two cameras or points; out of range where
-    there is none."""
-
+    # for each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
+    # is no block
     places: tuple[tuple[int, int], ...] = field(metadata={"static": True})
-    """For each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
-    is no block."""
 
 
 def laid_out(problem: BundleProblem) -> BundleProblem:

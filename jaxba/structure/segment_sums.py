@@ -34,8 +34,7 @@ def take_each(rows: Array | list[Array], index: Int[AnyArray, " n"]) -> list[Arr
 
     For rows that are stored as one array `take` is usually faster: 0.37 instead of 1.02 ms for nine components of 250
     cameras on 125,000 slots. For the three coordinates of points it is slower: point iterations took 1.1 to 1.3 times
-    as long with `take`.
-    """
+    as long with `take`."""
     return [take(row, index) for row in rows]
 
 
@@ -57,8 +56,7 @@ def as_rows(columns: list[Float[Array, " n"]]) -> Float[Array, "n k"]:
     """`jnp.stack(columns, axis=1)`, as a concatenation.
 
     XLA compiles the stack to a loop that selects the vector for every entry: 2.5 instead of 0.8 ms for twenty vectors
-    on 125,000 slots, two cores.
-    """
+    on 125,000 slots, two cores."""
     return jnp.concatenate([column[:, None] for column in columns], axis=1)
 
 
@@ -67,8 +65,7 @@ def outer_sum(left: Float[Array, "n terms a"], right: Float[Array, "n terms b"])
 
     XLA on a CPU compiles this to one fused loop, vectorised and multi-threaded. Its batched matrix product takes 1.7
     times as long for blocks of this size. But it is a call of a library, as fast when compiled without optimisation,
-    and that makes the loop 16 times as slow: so under `fast_compilation` it is the product.
-    """
+    and that makes the loop 16 times as slow: so under `fast_compilation` it is the product."""
     if fast_compilation.value:
         return lax.dot_general(left, right, (((1,), (1,)), ((0,), (0,))), precision="highest")
     total = left[:, 0, :, None] * right[:, 0, None, :]
@@ -90,23 +87,18 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     For fewer kernels the rows of a level are gathered one by one and added if they have one axis, and gathered together
     and reduced if they have more: each of the two is one kernel there, and many in the other case. XLA would fuse the
     levels of the second kind into one kernel, which computes what they sum again for each: 96 instead of 2 ms for the
-    five levels of Ladybug-49, padded.
-    """
+    five levels of Ladybug-49, padded."""
     for level in levels:
         if rows.ndim > 2:
-            rows = compute_unfused(_level_sum, rows, jnp.asarray(level), index=level)
+            level_sum = lambda rows, level: jnp.sum(take_rows(rows, level), axis=1)
+            rows = compute_unfused(level_sum, rows, jnp.asarray(level), index=level)
             continue
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
         rows = functools.reduce(operator.add, parts)
     return rows
 
 
-def _level_sum(rows: Array, level: Array) -> Array:
-    return jnp.sum(take_rows(rows, level), axis=1)
-
-
-UNROLLED_RANKS = 4
-"""Ranks of a level up to which each is gathered by itself. More of them are few rows each, and take long to compile."""
+UNROLLED_RANKS = 4  # ranks of a level up to which each is gathered by itself. More take long to compile.
 
 
 def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "_ _"], ...], axis: int) -> Array:
@@ -179,8 +171,7 @@ def point_sums_of(
 ) -> list[Float[Array, " points"]]:
     """`point_sums` of what `compute_in_one_loop(function, *operands)` returns.
 
-    With chunks it is summed over these in the loop that computes it, and never stored.
-    """
+    With chunks it is summed over these in the loop that computes it, and never stored."""
     if layout.point_levels is None or fast_compilation.value:
         return point_sums(layout, compute_in_one_loop(function, *operands))
 

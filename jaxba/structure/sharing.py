@@ -18,17 +18,10 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 class Sharing(ArrayRecord):
     """The matrix T that copies unknowns to items, the rows of arrays: `d = T y`."""
 
-    index: Int[AnyArray, " items"]
-    """The unknown of each item."""
-
-    owners: Int[AnyArray, " owners"]
-    """Unknowns of several items."""
-
-    distinct: int = field(metadata={"static": True})
-    """Number of unknowns."""
-
-    several: bool = field(metadata={"static": True})
-    """Whether any two items are one unknown."""
+    index: Int[AnyArray, " items"]  # the unknown of each item
+    owners: Int[AnyArray, " owners"]  # unknowns of several items
+    distinct: int = field(metadata={"static": True})  # number of unknowns
+    several: bool = field(metadata={"static": True})  # whether any two items are one unknown
 
     @classmethod
     def of(cls, names: Int[np.ndarray, " items"]) -> Sharing:
@@ -95,9 +88,7 @@ class Mask(ArrayRecord):
     """Where something holds."""
 
     values: Bool[AnyArray, "..."]
-
-    everywhere: bool = field(metadata={"static": True})
-    """Whether it holds everywhere, so that there is nothing to do."""
+    everywhere: bool = field(metadata={"static": True})  # whether it holds everywhere, so that there is nothing to do
 
     @classmethod
     def of(cls, values: Bool[np.ndarray, "..."]) -> Mask:

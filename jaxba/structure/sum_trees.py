@@ -13,21 +13,15 @@ from jaxtyping import Int
 
 from jaxba.structure.agreement import ALONE, Agreement
 
-TREE_WIDTH = 8
-"""Width of the chunks on all levels but the first."""
+TREE_WIDTH = 8  # width of the chunks on all levels but the first
 
 
 class Room(NamedTuple):
     """Upper bounds from which the shapes of a tree follow, so that they do not depend on the data."""
 
-    items: int
-    """Largest number of items of all targets together."""
-
-    most: int
-    """Largest number of items of one target."""
-
-    exact: bool = False
-    """Whether these are the numbers of the data themselves, so that shapes depend on them."""
+    items: int  # largest number of items of all targets together
+    most: int  # largest number of items of one target
+    exact: bool = False  # whether these are the numbers of the data themselves, so that shapes depend on them
 
     @classmethod
     def of(cls, counts: Int[np.ndarray, " targets"]) -> Room:
@@ -85,13 +79,11 @@ def sum_tree(
         most, width = -(-most // width), TREE_WIDTH
 
 
-PREFIX_SHARES = (
+PREFIX_SHARES = (  # most targets that have an item of a rank, relative to all items; the last suffices always
     lambda rank: min(1 / (2 * rank + 2), 1 / rank**2) if rank > 1 else 1 / (rank + 1),
     lambda rank: 1 / (2 * rank + 2) if rank > 1 else 1 / (rank + 1),
     lambda rank: 1 / (rank + 1),
 )
-"""Targets that have an item of a rank, relative to all items: at most what the last of these functions says. On real
-problems the first one suffices, or the second where tracks are long."""
 
 
 def prefix_levels(
@@ -139,8 +131,7 @@ def sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
     """Stable `argsort` of integers from 0 to below `most`.
 
     NumPy sorts 16 bits in linear time, by radix; larger keys are sorted together with their positions in one integer,
-    for which its fastest sort need not be stable. Both take a tenth of the time of its stable sort of 32 bits.
-    """
+    for which its fastest sort need not be stable. Both take a tenth of the time of its stable sort of 32 bits."""
     if most <= 1 << 16:
         return np.argsort(keys.astype(np.uint16), kind="stable").astype(np.int32)
     bits = len(keys).bit_length()

@@ -15,28 +15,17 @@ from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.padding import POINT_CHUNK, Capacity, room_for
 from jaxba.structure.sum_trees import prefix_levels
 
-MAX_PADDING = 0.10
-"""Largest number of empty slots relative to observations, besides one point of padding."""
+MAX_PADDING = 0.10  # largest number of empty slots relative to observations, besides one point of padding
 
 TILE = 8
-"""Points per tile of a large bucket, as many as the widest vector registers hold. A pass over the points reads one
-memory stream per observation of a point; without tiles these are a whole bucket apart, too many for the prefetcher and
-the TLB: a pass was measured to take twice as long."""
+"""Points per tile of a large bucket, as many as the widest vector registers hold. Without tiles a pass took twice as
+long: it reads a memory stream per observation of a point, a whole bucket apart, too many for prefetcher and TLB."""
 
-TILED_POINTS = 512
-"""Smaller buckets are a single tile: they fit the cache, and need no padding to a multiple of `TILE`."""
-
-_MAX_BUCKET_PADDING = (1 + MAX_PADDING) / (1 + (TILE - 1) / TILED_POINTS) - 1
-"""The part of `MAX_PADDING` that is left, after padding to tiles, for different track lengths in one bucket."""
-
-Bucket = tuple[int, int, int]
-"""Number of tiles, slots per point, points per tile."""
-
-PENALTY_FACTOR = 0.8
-"""Factor between the penalties per bucket that are tried, until the padding is small enough."""
-
-PENALTIES = 16
-"""Number of penalties that are tried at once."""
+TILED_POINTS = 512  # smaller buckets are a single tile: they fit the cache, and need no padding to a multiple of `TILE`
+_MAX_BUCKET_PADDING = (1 + MAX_PADDING) / (1 + (TILE - 1) / TILED_POINTS) - 1  # what padding to tiles leaves
+Bucket = tuple[int, int, int]  # number of tiles, slots per point, points per tile
+PENALTY_FACTOR = 0.8  # factor between the penalties per bucket that are tried, until the padding is small enough
+PENALTIES = 16  # number of penalties that are tried at once
 
 
 class Slots(NamedTuple):
@@ -135,8 +124,7 @@ def _bucket_lengths(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
     Every bucket adds to the size of the compiled program, so that their number is penalised: dynamic programming over
     the distinct lengths minimises `slots + penalty * buckets`, for penalties that are lowered until the padding is
-    within `_MAX_BUCKET_PADDING`.
-    """
+    within `_MAX_BUCKET_PADDING`."""
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
     # slots of a bucket, by its last and first length

@@ -42,41 +42,19 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 class Unknowns(ArrayRecord):
     """The unknowns of a problem: of cameras and points, which are optimised, and which are the same."""
 
-    poses: Sharing
-    """Cameras that move together: those of a frame."""
-
-    lenses: Sharing
-    """Observed cameras that have a lens in common of which something is optimised."""
-
-    own: tuple[Sharing, ...]
-    """Of each block of residuals of one's own, which cameras have a row of it in common."""
-
-    free: Mask
-    """Which unknowns of each camera's block are optimised, [width, cameras]."""
-
-    free_points: Mask
-    """Which points are optimised, in layout order."""
-
-    model: Int[AnyArray, " cameras"]
-    """Camera model of each camera, a position in `models`."""
-
-    models: tuple[CameraModel, ...] = field(metadata={"static": True})
-    """Camera models."""
-
-    all_shared: bool = field(metadata={"static": True})
-    """Whether every observed camera has a lens in common with others."""
-
+    poses: Sharing  # cameras that move together: those of a frame
+    lenses: Sharing  # observed cameras that have a lens in common of which something is optimised
+    own: tuple[Sharing, ...]  # of each block of residuals of one's own, which cameras have a row of it in common
+    free: Mask  # which unknowns of each camera's block are optimised, [width, cameras]
+    free_points: Mask  # which points are optimised, in layout order
+    model: Int[AnyArray, " cameras"]  # camera model of each camera, a position in `models`
+    models: tuple[CameraModel, ...] = field(metadata={"static": True})  # camera models
+    all_shared: bool = field(metadata={"static": True})  # whether every observed camera shares a lens with others
+    # numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block, ascending
     columns: tuple[int, ...] = field(metadata={"static": True})
-    """Numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block, ascending."""
-
-    lens_size: int = field(metadata={"static": True})
-    """Number of all intrinsics of a camera."""
-
-    own_sizes: tuple[int, ...] = field(metadata={"static": True})
-    """Numbers of these blocks, the last ones of a camera."""
-
-    in_rigs: bool = field(metadata={"static": True})
-    """Whether poses are those of frames, and the last numbers of a camera its extrinsics (problem/rigs.py)."""
+    lens_size: int = field(metadata={"static": True})  # number of all intrinsics of a camera
+    own_sizes: tuple[int, ...] = field(metadata={"static": True})  # numbers of these blocks, the last ones of a camera
+    in_rigs: bool = field(metadata={"static": True})  # whether poses are those of frames, extrinsics the last numbers
 
     @property
     def places(self) -> tuple[int, ...]:
@@ -219,7 +197,7 @@ def _frames(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
 NONE_SHARED = Sharing.of(np.zeros(0, np.int32))
 ALL_FREE = Mask(np.zeros(0, bool), True)
 
-BAL_UNKNOWNS = Unknowns(
+BAL_UNKNOWNS = Unknowns(  # those of BAL cameras, all of whose numbers are optimised, however many there are
     poses=NONE_SHARED,
     lenses=NONE_SHARED,
     own=(),
@@ -233,4 +211,3 @@ BAL_UNKNOWNS = Unknowns(
     own_sizes=(),
     in_rigs=False,
 )
-"""Those of BAL cameras, all of whose numbers are optimised, however many there are."""

@@ -33,11 +33,8 @@ EVALUATIONS = 10  # evaluations of a training, after equal parts of it
 class PresetGame(Game):
     """A game with the settings that an agent is trained with."""
 
-    held_out: tuple[Bank, ...] = ()
-    """Scenes that no training sees, a bank per class."""
-
-    preset: TrainConfig = field(default_factory=TrainConfig, metadata={"static": True})
-    """Everything else: networks, learning, sizes."""
+    held_out: tuple[Bank, ...] = ()  # scenes that no training sees, a bank per class
+    preset: TrainConfig = field(default_factory=TrainConfig, metadata={"static": True})  # everything else
 
 
 def make_env(

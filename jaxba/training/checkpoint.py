@@ -85,7 +85,7 @@ def _path(folder: Path, step: int) -> Path:
 
 
 def steps(folder: Path) -> list[int]:
-    """Numbers of the complete checkpoints in a folder, in order; those of earlier versions too, which were folders."""
+    """Numbers of the complete checkpoints in a folder, in order."""
     if not folder.is_dir():
         return []
     names = [item.name.removesuffix(_SUFFIX) for item in folder.iterdir() if item.name.startswith(_PREFIX)]

@@ -25,14 +25,8 @@ from jaxba.training.train_loop import LoopConfig
 
 MethodName = Literal["lm", "stba", "deeplm"]
 
-CLUSTER_CAMERAS = 4
-"""Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
-scenes of the game."""
-
-CG_ROUNDS = 2
-"""Iterations of `cg` per unknown of the cameras. One is enough without rounding. Two leave a predicted decrease within
-1e-10 of the exact one, 10 x 10 scenes at lambda 1e-10."""
-
+CLUSTER_CAMERAS = 4  # most cameras in a cluster: the default of methods is too large for scenes of the game
+CG_ROUNDS = 2  # iterations of `cg` per camera unknown: predicted decrease within 1e-10, 10 x 10 scenes, lambda 1e-10
 METADATA_BYTES = 1 << 14  # reserved for the metadata of a policy file, of which the configuration takes 3 kB
 
 
@@ -95,8 +89,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            check_count(name, getattr(self, name), 1)
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 to 2147483647, not {self.seed}")
         if len(self.envs) != len(self.bank.classes):

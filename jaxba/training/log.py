@@ -78,9 +78,7 @@ def read(folder: Path) -> list[Row]:
 def _lines(path: Path) -> tuple[list[tuple[bytes, Row]], int]:
     """The lines that hold a row, with that row, and how many do not: cut short, or zeros after a power failure."""
     found: list[tuple[bytes, Row]] = []
-    if not path.is_file():
-        return found, 0
-    lines = path.read_bytes().splitlines(keepends=True)
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
     for line in lines:
         try:
             row = json.loads(line)

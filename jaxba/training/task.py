@@ -34,7 +34,7 @@ RULES = "rules.npz"
 EMBEDDED = "+embedded"  # ending of the name of a rule that has the embedded iterations of the agent's step
 CONSTANT = "constant action"  # name of the best constant action on training scenes
 
-BASELINES = (
+BASELINES = (  # rules without the ending have plain steps; `bold` the game's guard; `guarded`, `learned` their own
     "ceres",
     "classic",
     "gtsam",
@@ -47,13 +47,9 @@ BASELINES = (
     LEARNED,
     CONSTANT,
 )
-"""What a trained policy is compared with. Without the ending, rules have plain steps of the method. `bold` is the
-smallest lambda that the game's own guard allows, with the agent's step. `guarded` and `learned` are what ships, with
-their own steps and guards."""
 
 TRAINED = "trained"  # name of the trained policy in tables
 WEIGHTLESS = "its weights zero"  # name of the trained policy without its weights (`without_weights`)
-
 
 Comparison: TypeAlias = tuple[dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]]
 """Trained policies on the held-out scenes: scores by name (of every agent if there are several, of all agents and of
@@ -140,24 +136,20 @@ def build(
     line when something long begins; `baselines` are names to compare with, unless the folder has results; `BASELINES`
     if None; `on_game` is called with the game first. Raises ValueError: too few scenes are usable, or another version
     wrote the files; one line for a person. Raises OSError: the folder cannot be written or read."""
-    splits = _splits(config, folder, report)
+    path = folder / BANK
+    if path.is_file():
+        report("reading the scenes")
+        splits = read_banks(path)
+    else:
+        key, limit = jax.random.key(config.seed), config.game.max_iterations
+        splits = make_banks(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
+        _write_banks(path, splits)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
     on_game(game)
     runs = _baseline_runs(config, folder, game, held_out, report, baselines)
     return Task(config, game, held_out, runs)
-
-
-def _splits(config: TrainConfig, folder: Path, report: Callable[[str], None]) -> list[Split]:
-    path = folder / BANK
-    if path.is_file():
-        report("reading the scenes")
-        return read_banks(path)
-    key, limit = jax.random.key(config.seed), config.game.max_iterations
-    splits = make_banks(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
-    _write_banks(path, splits)
-    return splits
 
 
 def _baseline_runs(

@@ -40,11 +40,9 @@ def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | No
     count = len(numbers)
     focal, center, flipped = np.ones((count, 2)), np.zeros((count, 2)), np.zeros(count, bool)
     lenses = problem.lenses
-    models, kind = (BAL,), np.zeros(count, int)
-    if lenses is not None:
-        models = lenses.models
-        if lenses.model is not None:
-            kind = np.asarray(lenses.model)[np.asarray(lenses.index)]
+    models, kind = (BAL,) if lenses is None else lenses.models, np.zeros(count, int)
+    if lenses is not None and lenses.model is not None:
+        kind = np.asarray(lenses.model)[np.asarray(lenses.index)]
     for at, model in enumerate(models):
         own = np.flatnonzero(kind == at)
         flipped[own] = model is BAL
@@ -55,11 +53,9 @@ def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | No
         if model.principal_point:
             center[own] = numbers[own][:, list(model.principal_point)]
     focal = np.where(np.abs(focal) > 0, np.abs(focal), 1.0)
-    if sizes is not None and sizes.all():
-        reach = sizes / 2
-    else:
-        reach = _reach(problem, center)
-        reach = reach if sizes is None else np.where(sizes > 0, sizes / 2, reach)
+    reach = _reach(problem, center)
+    if sizes is not None:
+        reach = np.where(sizes > 0, sizes / 2, reach)
     return Frusta(focal, center, flipped, np.clip(reach / focal, 1e-3, WIDEST))
 
 

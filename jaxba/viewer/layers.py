@@ -10,8 +10,7 @@ from jaxtyping import Float
 
 from jaxba.viewer.extra import viser
 
-Clicked = Callable[[int, viser.SceneNodePointerEvent], None] | None
-"""Called with the number of an image whose frustum was clicked, and the event."""
+Clicked = Callable[[int, viser.SceneNodePointerEvent], None] | None  # with the number of an image, and the event
 
 
 class Layers:

@@ -10,8 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 
-VIRIDIS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
-"""Colours from low to high. Source: matplotlib's viridis at 0, 1/4, 1/2, 3/4 and 1."""
+VIRIDIS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))  # matplotlib's, at quarters
 
 
 class Measures(NamedTuple):

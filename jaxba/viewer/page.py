@@ -22,10 +22,9 @@ from jaxba.viewer.sources import Shown
 from jaxba.viewer.stage import ERROR, POINT_SIZE, SHOWN_POINTS, Stage
 
 NOTHING: str = "none: the whole scene"
-
-FRAME_S, PICKED, NEAR = 0.5, 8, 0.3
-"""Seconds for which an iteration is shown while the page plays; the largest distance between a click and the point that
-it means, pixels; and how near, as a share of the way to an image, something is drawn in the view of its camera."""
+FRAME_S = 0.5  # seconds for which an iteration is shown while the page plays
+PICKED = 8  # pixels at most between a click and the point that it means
+NEAR = 0.3  # how near something is drawn in the view of an image's camera, as a share of the way to the image
 
 
 class Viewer:

@@ -19,16 +19,11 @@ from jaxba.viewer.sources import Shown
 SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500  # most on a page; software rendering draws them at a few frames a second
 POINT_SIZE = 0.006  # of points; scenes have a size of about one
 ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)  # distance between neighbouring stages, and where the name of one of several is
-
 FILE, ERROR, TRACK, IMAGE = "colour of the file", "reprojection error", "track length", "error of images"
-"""What colours may mean, the first three those of points."""
-
-CHOSEN, CHOSEN_SIDE, RESIDUAL = (255, 120, 0), 1600, (208, 0, 0)
-"""Colour of what is chosen, pixels of the longer side of its image, and colour of its residuals."""
-
+CHOSEN, RESIDUAL = (255, 120, 0), (208, 0, 0)  # colours of what is chosen, and of its residuals
+CHOSEN_SIDE = 1600  # pixels of the longer side of the chosen image
+# colours of residuals besides those of pixels. Source: Okabe and Ito 2008, "Color Universal Design"
 KINDS = ((0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (213, 94, 0))
-"""Colours of residuals besides those of pixels. Source: Okabe and Ito 2008, "Color Universal Design"."""
-
 BEFORE, TYPICAL = 0.99, 0.015  # shares: depth of residuals in their image's, median length in its width
 
 

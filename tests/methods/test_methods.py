@@ -15,7 +15,7 @@ import support
 from support import DAMPINGS, bal_file, check_step, needs_data, solve, start, step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal
-from jaxba.linear.schur import DampedSystem, apply_reduced
+from jaxba.linear.schur import DampedSystem, apply_reduced, lift_to_cameras
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.stba import (
     StochasticClusters,
@@ -24,7 +24,6 @@ from jaxba.methods.stba import (
     eliminate_replicas,
     richardson,
     solve_clusters,
-    split_right_hand_side,
 )
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
@@ -96,7 +95,7 @@ def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     problem, options = support.tiny(), MANIFOLD
     system, part = systems(problem, options, damping)
     split = eliminate_replicas(system.layout, system.linear, jnp.asarray(damping), part, options)
-    right = split_right_hand_side(system.layout, system.linear, system.cameras, split)
+    right = lift_to_cameras(system.layout, system.linear, *split) - system.cameras.gradient
     parts = system._replace(points=system.points._replace(projected=split[0]))
     found = solve_clusters(parts, right, part)
     truth = support.dense(pieces(problem, np.asarray(part.label)), options, damping)

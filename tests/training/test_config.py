@@ -149,7 +149,7 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("game.reward=fun", "game.reward must be one of constant, clock, reduction, reversed, is 'fun'"),
         ("sac.width=[", "not YAML"),
         ("sac.width", "must be key=value"),
-        ("chunks=0", "chunks must be at least 1, not 0"),
+        ("chunks=0", "chunks must be at least 1, is 0"),
         ("seed=-1", "seed must lie in"),
         ("envs=[1, 2]", "envs: 2 numbers for 1 classes"),
         ("envs=[0]", "at least one environment"),

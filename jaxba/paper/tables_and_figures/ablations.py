@@ -15,9 +15,7 @@ from jaxba.paper.runner import Built, Method, Runner
 from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, SCENES, Line, Part, Table, named, ours
 from jaxba.solver.options import SolveOptions
 
-STATE_SIZES = {1: 7.5, 5: 4.0, 10: 4.5, 20: 5.0}
-"""Iterations by state size. Source: the paper, table "Acceleration with different state sizes on BAL"."""
-
+STATE_SIZES = {1: 7.5, 5: 4.0, 10: 4.5, 20: 5.0}  # iterations by state size. Source: the paper, table on BAL
 AVERAGE = "schedule-of-our-agent"  # name of the schedule that `average_schedule` makes
 
 OURS, CLOCK, REDUCTION, REVERSED = (one.name for one in (agents.OURS, agents.CLOCK, agents.REDUCTION, agents.REVERSED))
@@ -85,11 +83,7 @@ TABLES = (
         ],
         lambda runner: {"net": runner.config.zero_net},
     ),
-    _ablation(
-        "state-size",
-        _sized,
-        _size_statements,
-    ),
+    _ablation("state-size", _sized, _size_statements),
     _ablation(
         "reversed",
         lambda runner: [Line("reversed: 5 durations, error", runner.agent(agents.REVERSED), 10.0)],

@@ -21,12 +21,11 @@ from jaxba.solver.record import Record
 CLASSIC, CERES = "classic", "ceres"  # rules with which every table compares: the paper's baseline and Ceres'
 SCENES = Problems("synthetic", ())  # stands for the synthetic scenes, which are played and not solved one by one
 _SECTIONS = Path(__file__).parents[1].joinpath("texts.md").read_text(encoding="utf-8").split("\n## ")[1:]
-TEXTS = {
+TEXTS = {  # what the report says of each table or figure: its title, its heading, and the paragraph below that
     name: (title, heading.removeprefix("### "), " ".join(text.split()))
     for head, heading, text in (section.split("\n\n", 2) for section in _SECTIONS)
     for name, _, title in [head.partition(": ")]
 }
-"""What the report says of each table or figure: its title, its heading, and the paragraph below that."""
 
 NOT_YET = "Not run in this folder yet."  # text of the report if there are no results
 

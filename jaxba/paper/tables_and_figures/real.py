@@ -130,15 +130,13 @@ def _synthetic(runner: Runner) -> list[Part]:
     ]
 
 
-FAMILY_SECONDS = {
+FAMILY_SECONDS = {  # of Ceres-CG, DeepLM, DeepLM with the agent. Source: the paper, on BAL's sub-problems
     "Trafalgar": (65.1, 10.2, 5.6),
     "Ladybug": (46.7, 15.35, 8.1),
     "Dubrovnik": (320.0, 10.0, 4.1),
     "Venice": (1992.0, 60.0, 31.4),
     "Final": (3897.0, 65.0, 33.7),
 }
-"""Seconds of Ceres-CG, DeepLM, and DeepLM with the agent. Source: the paper, table "Acceleration of BAL's
-sub-problems"."""
 
 
 def _families(runner: Runner) -> list[Part]:
