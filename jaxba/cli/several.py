@@ -28,7 +28,7 @@ from jaxba.solver.solve import Solution
 COSTS = "costs.csv"
 """Name of the file of costs in the folder of solutions."""
 
-FOR_ONE = ("log", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices")
+FOR_ONE = ("log", "covariance", "record", "view", "retriangulate", "reject", "processes", "distributed", "devices")
 """Options of a single problem."""
 
 PROGRESS_S = 0.2, 10.0
@@ -193,7 +193,7 @@ def _stored(output: Path, solution: Solution, source: str) -> Result:
     """The solution after it was written, or why it could not be."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        store(str(output), solution.problem, source)
+        store(str(output), solution, source)
         return solution
     except (OSError, ProblemError) as error:
         return error

@@ -19,7 +19,7 @@ from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
 from jaxba.cli.options import options, parse
-from jaxba.cli.output import check_outputs, check_storable, write_solution
+from jaxba.cli.output import check_outputs, check_storable, fitting, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
 from jaxba.damping import DampingPolicy
@@ -173,6 +173,9 @@ class Stop:
 
     retriangulate: bool = False
     """After convergence, move points to depths with a lower cost and go on."""
+
+    reject: bool = False
+    """Find wrong matches; solve and write without them."""
 
 
 @options
@@ -329,6 +332,7 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
+    common.require(not (args.reject and args.retriangulate), "--reject and --retriangulate exclude each other")
     problems = [name for name in (args.problem, *args.more) if name]
     if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
         from jaxba.cli import several
@@ -349,9 +353,10 @@ def _solve(args: Arguments) -> int:
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
     if args.output:
-        write_solution(args.output, solution.problem, path)
+        write_solution(args.output, solution, path)
     if args.covariance:
-        solved = hold(solution.problem, lenses="all") if args.intrinsics == "fixed" else solution.problem
+        solved = fitting(solution)
+        solved = hold(solved, lenses="all") if args.intrinsics == "fixed" else solved
         _write_covariance(args.covariance, solved, options.loss)
     if args.log:
         from jaxba.io import json_lines
@@ -438,6 +443,10 @@ def _iterate(
             return interrupt.requested
 
         hooks = {"callback": show, "watch": watch, "verbose": True}
+        if args.reject:
+            from jaxba.results.graduated import solve_graduated
+
+            return solve_graduated(problem, policy, options, **hooks), steps
         if not args.retriangulate:
             return solve(problem, policy, options, **hooks), steps
         from jaxba.results.alternation import solve_and_retriangulate

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState, StepInfo
@@ -84,6 +84,9 @@ class Solution(ArrayRecord):
 
     set_aside: Int[np.ndarray, " away"] = field(default_factory=lambda: np.zeros(0, int))
     """Cameras that face away from their points (problem/facing.py). Their views count in no cost, and they stay."""
+
+    rejected: Bool[np.ndarray, " observations"] | None = None
+    """Wrong matches that `solve_graduated` found, which count in no cost; None of other solves."""
 
     @property
     def converged(self) -> bool:

@@ -1,0 +1,65 @@
+"""Several solves of one problem, one after the other, that look like one from outside."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+from jaxtyping import Int
+
+from jaxba.damping import DampingPolicy
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.solver.drivers import Callback, IterationRecord, Watch
+from jaxba.solver.options import SolveOptions
+from jaxba.solver.solve import Solution, joined, solve_without
+from jaxba.typing import AnyArray
+
+
+class Consecutive:
+    """Solves with one policy. Callback and watch count iterations and seconds over all of them."""
+
+    stopped = False
+    """Whether the callback has asked to stop."""
+
+    def __init__(
+        self,
+        policy: str | DampingPolicy,
+        callback: Callback | None,
+        watch: Watch | None,
+        compiling: Callable[[], AbstractContextManager],
+    ) -> None:
+        self._policy, self._callback, self._watch, self._compiling = policy, callback, watch, compiling
+        self.done: list[Solution] = []
+
+    @property
+    def total(self) -> Solution:
+        """All solves together."""
+        return functools.reduce(joined, self.done)
+
+    def solve(
+        self, away: Int[AnyArray, " away"], problem: BundleProblem, options: SolveOptions, whole: BundleProblem
+    ) -> Solution:
+        """`solve_without`; who watches sees the parameters in `whole`. It runs from Python, so that all limits use the
+        same programs."""
+        count, seconds = sum(one.iterations for one in self.done), sum(one.total_s for one in self.done)
+        watch = self._watch
+
+        def of_all(record: IterationRecord) -> IterationRecord:
+            return record._replace(iteration=record.iteration + count, time_s=record.time_s + seconds)
+
+        def forward(record: IterationRecord) -> bool:
+            self.stopped = bool(self._callback and self._callback(of_all(record)))
+            return self.stopped
+
+        seen = watch and (lambda record, now: watch(of_all(record), lambda: with_parameters(whole, now())))
+        hooks = {"callback": forward, "watch": seen, "compiling": self._compiling}
+        found = solve_without(away, problem, self._policy, options, **hooks)
+        self.done.append(found)
+        return found
+
+
+def with_parameters(problem: BundleProblem, found: BundleProblem) -> BundleProblem:
+    """The problem with the parameters of another one, of other observations."""
+    names = ("cameras", "points", "rigs", "residuals")
+    return problem.replace(**{name: getattr(found, name) for name in names})
