@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
+import numpy as np
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
@@ -13,7 +14,6 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.drivers import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import Solution, joined, solve_without
-from jaxba.typing import AnyArray
 
 
 class Consecutive:
@@ -38,7 +38,7 @@ class Consecutive:
         return functools.reduce(joined, self.done)
 
     def solve(
-        self, away: Int[AnyArray, " away"], problem: BundleProblem, options: SolveOptions, whole: BundleProblem
+        self, away: Int[np.ndarray, " away"], problem: BundleProblem, options: SolveOptions, whole: BundleProblem
     ) -> Solution:
         """`solve_without`; who watches sees the parameters in `whole`. It runs from Python, so that all limits use the
         same programs."""

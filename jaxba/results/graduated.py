@@ -96,8 +96,8 @@ def solve_graduated(
     every = np.ones(problem.num_observations, bool)
     found, scale = _descend(solves, problem, away, options, FIRST * _median(problem, every, counted), max_residual)
     kept, lost = _fitting(found, scale)
-    constant = constants_of(problem.constants, problem.num_cameras, problem.num_points).poses.any(axis=1)
-    again = NO_CAMERAS if problem.rigs else lost[~constant[lost]]
+    poses = constants_of(problem.constants, problem.num_cameras, problem.num_points).poses
+    again = NO_CAMERAS if problem.rigs else lost[~np.asarray(poses)[lost].any(axis=1)]
     if len(again) and kept.any():
         found = _posed_again(solves, found, again, kept, options, scale)
         found, scale = _descend(solves, found, NO_CAMERAS, options, FALL * scale, max_residual)
