@@ -28,7 +28,7 @@ from jaxba.problem.facing import facing_away, views_behind
 from jaxba.problem.hold import hold
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
-from jaxba.problem.preprocess import MIN_TRACK
+from jaxba.problem.preprocess import MIN_TRACK, observed
 from jaxba.problem.residuals import Residuals
 from jaxba.results.consecutive import Consecutive, with_parameters
 from jaxba.solver.drivers import Callback, Watch
@@ -54,6 +54,9 @@ FEWEST = 0.25
 LEAST_WEIGHT = 1e-6
 """Smallest factor of a residual."""
 
+LEAST_MEDIAN = 1e-3
+"""Least median that counts: what is below is rounding, in pixels without noise."""
+
 
 def solve_graduated(
     problem: BundleProblem,
@@ -69,10 +72,11 @@ def solve_graduated(
 
     It needs right matches to be the majority. Solves with falling weights of large residuals come first; the last has
     the loss of the options, and the observations that are left: with a residual up to `max_residual`, in front of the
-    camera, and of a point that two of them see. An image that keeps less than `FEWEST` of its observations loses all
-    of them, and its pose is that of the start (`Solution.set_aside`). `Solution.rejected` says which are gone;
-    `problem.subset(~solution.rejected)` is what was solved last. Costs in the history are weighted, and the initial
-    cost is that of the observations that are left. Raises ValueError, ProblemError: as `solve`, or nothing is left.
+    camera, and of a point that two of them see. An image that keeps less than `FEWEST` of its observations loses all of
+    them, and its pose is that of the start unless a rig moves it (`Solution.set_aside`). `Solution.rejected` says which
+    are gone; `problem.subset(~solution.rejected)` is what was solved last. Costs in the history are weighted, and the
+    initial cost is that of the observations that are left. Raises ValueError, ProblemError: as `solve`, or nothing is
+    left.
 
     Args:
         problem: start of the optimisation.
@@ -87,6 +91,8 @@ def solve_graduated(
     """
     check_problem(problem)
     options = checked_options(options)
+    if not problem.num_observations:
+        raise ProblemError("the problem has no observations, of which wrong ones might be rejected")
     if not max_residual >= 0:
         raise ValueError(f"max_residual must not be negative, is {max_residual}")
     callback, compiling = shown(callback, verbose)
@@ -108,6 +114,8 @@ def solve_graduated(
         found = found.replace(cameras=cameras)
     if not kept.any():
         raise ProblemError("no observation fits: there are more wrong matches than right ones, or the start is bad")
+    seen = observed(problem.subset(kept))[1][:, None]
+    found = found.replace(points=np.where(seen, found.points, problem.points))
     none = replace(options, max_iterations=0)
     start = Consecutive(policy, None, None, compiling).solve(NO_CAMERAS, problem.subset(kept), none, problem)
     last = solves.solve(NO_CAMERAS, found.subset(kept), none if solves.stopped else options, found)
@@ -135,7 +143,7 @@ def _descend(
     options = replace(options, loss=Loss(), max_iterations=limit, tolerances=tolerances)
     counted, good = ~np.isin(problem.camera_index, away), np.ones(problem.num_observations, bool)
     floor = last or LAST * _median(problem, good, counted)
-    for _ in range(STAGES if limit else 0):
+    for _ in range(STAGES if limit and not solves.stopped else 0):
         root = np.maximum(1 / (1 + (_distances(problem, good) / scale) ** 2), LEAST_WEIGHT)
         own = np.eye(2) if problem.whitening is None else np.asarray(problem.whitening)
         found = solves.solve(away, problem.replace(whitening=root[:, None, None] * own), options, problem)
@@ -157,7 +165,7 @@ def _distances(problem: BundleProblem, good: Bool[np.ndarray, " n"]) -> Float[np
 
 
 def _median(problem: BundleProblem, good: Bool[np.ndarray, " n"], counted: Bool[np.ndarray, " n"]) -> float:
-    return max(float(np.median(_distances(problem, good)[counted])), 1e-12)
+    return max(float(np.median(_distances(problem, good)[counted])), LEAST_MEDIAN)
 
 
 def _fitting(problem: BundleProblem, scale: float) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " lost"]]:

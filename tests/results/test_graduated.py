@@ -68,6 +68,9 @@ def test_the_rest_ends_as_without_wrong_matches(how):
     right &= np.bincount(problem.point_index[right])[problem.point_index] > 1  # else nothing says so
     assert np.mean(solution.rejected[right]) < (0.01 if how == "well" else 0.05)
     np.testing.assert_array_equal(solution.problem.cameras[lost, :6], start.cameras[lost, :6])
+    gone = np.setdiff1d(np.arange(problem.num_points), problem.point_index[~solution.rejected])
+    assert len(gone)
+    np.testing.assert_array_equal(solution.problem.points[gone], start.points[gone])
     check(solution, scene(), ~wrong)
     assert solution.final_cost < solution.initial_cost
     assert len(solution.history.cost) == solution.iterations
@@ -87,7 +90,7 @@ def test_other_residuals_keep_their_weight():
 
 def test_iterations_are_counted_over_all_solves_and_a_callback_ends_them():
     seen = []
-    problem, _ = with_wrong(scene(), 0.3)
+    problem = with_images(with_wrong(scene(), 0.3)[0], "turned")
     solution = solve_graduated(problem, options=QUICK, callback=lambda record: seen.append(record) or len(seen) == 7)
     assert [record.iteration for record in seen] == list(range(1, 8))
     assert solution.iterations == 7
