@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from jaxba.results.bundle_adjustment import bundle_adjustment
     from jaxba.results.covariance import Covariance, covariance
     from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
+    from jaxba.results.graduated import solve_graduated
     from jaxba.results.retriangulate import Retriangulation, retriangulate
     from jaxba.solver.many import solve_many
     from jaxba.solver.recipes import solve_recipes
@@ -89,6 +90,7 @@ _LATE = {
     "results.bundle_adjustment": ("bundle_adjustment",),
     "results.covariance": ("Covariance", "covariance"),
     "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
+    "results.graduated": ("solve_graduated",),
     "results.retriangulate": ("Retriangulation", "retriangulate"),
     "solver.many": ("solve_many",),
     "solver.recipes": ("solve_recipes",),
@@ -181,6 +183,7 @@ __all__ = [
     "scene_like",
     "solve",
     "solve_and_retriangulate",
+    "solve_graduated",
     "solve_loop",
     "solve_many",
     "solve_recipes",

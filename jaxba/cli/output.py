@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
+import numpy as np
+
 from jaxba.cli import common, table
 from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
 from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem
 from jaxba.io.bal import check_bal_lenses
 from jaxba.io.files import StrPath
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.solver.solve import Solution
 
 
 def is_model(output: str, source: str | None) -> bool:
@@ -59,19 +62,27 @@ def check_storable(output: str | None, problem: BundleProblem, source: str | Non
             check_bal_lenses(problem, output)
 
 
-def store(output: str, problem: BundleProblem, source: str | None) -> None:
-    """Writes a solution. Raises OSError, ProblemError: it cannot be written."""
+def store(output: str, solution: Solution, source: str | None) -> None:
+    """Writes a solution, without what it rejected. Raises OSError, ProblemError: it cannot be written."""
     if _is_like_source(output, source):
-        write_colmap(problem, output, like=source)
+        write_colmap(solution.problem, output, like=source, rejected=solution.rejected)
     else:
-        write_problem(problem, output)
+        write_problem(fitting(solution), output)
 
 
-def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
+def fitting(solution: Solution) -> BundleProblem:
+    """The solved problem without observations that were rejected, and without points that only they saw."""
+    if solution.rejected is None or not solution.rejected.any():
+        return solution.problem
+    kept = ~solution.rejected
+    return solution.problem.subset(kept, points=np.unique(np.asarray(solution.problem.point_index)[kept]))
+
+
+def write_solution(output: str, solution: Solution, source: str | None) -> None:
     """Writes the solution, and prints what was written and what the file cannot store. Raises UsageError: it fails."""
     model, like = is_model(output, source), _is_like_source(output, source)
     try:
-        store(output, problem, source)
+        store(output, solution, source)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
     if model and not like:
@@ -79,5 +90,5 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
     common.print_line(f"wrote {output}")
     if formats.ending(output) and formats.by_ending(output) is None and not model:
         common.print_line(f"note: {output} is a BAL file; {formats.formats_written()}")
-    if not like and (lost := table.lost_in(problem, model)):
+    if not like and (lost := table.lost_in(solution.problem, model)):
         common.print_line(f"note: that {'model' if model else 'file'} cannot store: {lost}")

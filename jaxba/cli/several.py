@@ -28,8 +28,8 @@ from jaxba.solver.solve import Solution
 COSTS = "costs.csv"  # name of the file of costs in the folder of solutions
 
 FOR_ONE = (
-    *("log", "survey", "covariance", "record", "view", "retriangulate", "processes", "distributed", "devices"),
-    "recipes",
+    *("log", "survey", "covariance", "record", "view", "retriangulate", "reject", "processes", "distributed"),
+    *("devices", "recipes"),
 )
 """Options of a single problem."""
 
@@ -194,7 +194,7 @@ def _stored(output: Path, solution: Solution, source: str) -> Result:
     """The solution after it was written, or why it could not be."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        store(str(output), solution.problem, source)
+        store(str(output), solution, source)
         return solution
     except (OSError, ProblemError) as error:
         return error

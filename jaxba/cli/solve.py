@@ -19,7 +19,7 @@ from jaxba.cli import common, processes, survey_report, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import surveyed
 from jaxba.cli.options import options, parse
-from jaxba.cli.output import check_outputs, check_storable, write_solution
+from jaxba.cli.output import check_outputs, check_storable, fitting, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
 from jaxba.damping import DampingPolicy
@@ -181,6 +181,9 @@ class Stop:
     retriangulate: bool = False
     """After convergence, move points to depths with a lower cost and go on."""
 
+    reject: bool = False
+    """Find wrong matches; solve and write without them."""
+
 
 @options
 class Output:
@@ -339,6 +342,7 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
+    common.require(not (args.reject and args.retriangulate), "--reject and --retriangulate exclude each other")
     problems = [name for name in (args.problem, *args.more) if name]
     if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
         from jaxba.cli import several
@@ -349,6 +353,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.runtime.distributed import together
 
     path, problem, marks = together(lambda: _checked(args))
+    common.require(marks is None or not args.reject, "--reject is not for a file of control points")
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
@@ -365,10 +370,11 @@ def _solve(args: Arguments) -> int:
     if args.survey:
         survey_report.write(args.survey, rows)
     if args.output:
-        solved = solution.problem if marks is None else marks.without(solution.problem)
-        write_solution(args.output, solved, path)
+        own = solution if marks is None else replace(solution, problem=marks.without(solution.problem))
+        write_solution(args.output, own, path)
     if args.covariance:
-        solved = hold(solution.problem, lenses="all") if args.intrinsics == "fixed" else solution.problem
+        solved = fitting(solution)
+        solved = hold(solved, lenses="all") if args.intrinsics == "fixed" else solved
         _write_covariance(args.covariance, solved, options.loss, 0 if marks is None else len(marks.names))
     if args.log:
         from jaxba.io import json_lines
@@ -465,7 +471,7 @@ def _by_recipes(
 
     count = args.recipes or 0
     common.require(2 <= count <= len(RECIPES), f"--recipes must be 2 to {len(RECIPES)}")
-    others = {"--record": args.record, "--view": args.view, "--log": args.log, "--retriangulate": args.retriangulate}
+    others = {f"--{name}": getattr(args, name) for name in ("record", "view", "log", "retriangulate", "reject")}
     given = [name for name, value in {**others, "--devices and --processes": _is_divided(args)}.items() if value]
     common.require(not given, f"{', '.join(given)}: for one policy, not for --recipes")
     with common.notes_printed():
@@ -488,6 +494,10 @@ def _iterate(
             return interrupt.requested
 
         hooks = {"callback": show, "watch": watch, "verbose": True}
+        if args.reject:
+            from jaxba.results.graduated import solve_graduated
+
+            return solve_graduated(problem, policy, options, **hooks), steps
         if not args.retriangulate:
             return solve(problem, policy, options, **hooks), steps
         from jaxba.results.alternation import solve_and_retriangulate

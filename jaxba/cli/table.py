@@ -14,7 +14,7 @@ from jaxba.cli.common import counted
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import NAMED, views_behind, without_views_of
-from jaxba.problem.labels import part_names
+from jaxba.problem.labels import part_name, part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK, observed
@@ -82,7 +82,11 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
     """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
-    problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
+    left_out = rejected(solution)
+    if solution.rejected is None:
+        problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
+    else:
+        problem, end = (p.subset(~solution.rejected) for p in (problem, solution.problem))
     solution = replace(solution, problem=end)
     costs = [solution.initial_cost, solution.final_cost]
     if problem.residuals or not (loss or Loss()).trivial:  # else the residuals' own, in the solve's arithmetic
@@ -107,7 +111,25 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]
-    return "\n".join([*lines, *remarks(problem, solution), *without_weight(solution, loss or Loss())])
+    return "\n".join([*lines, *left_out, *remarks(problem, solution), *without_weight(solution, loss or Loss())])
+
+
+def rejected(solution: Solution) -> list[str]:
+    """A note on observations that were rejected, by image, and on images that lost all of them."""
+    if solution.rejected is None:
+        return []
+    problem, count = solution.problem, len(solution.rejected)
+    gone, views = (
+        np.bincount(problem.camera_index[mask], minlength=problem.num_cameras)
+        for mask in (solution.rejected, slice(None))
+    )
+    worst = np.argsort(-gone / np.maximum(views, 1), kind="stable")[: np.count_nonzero(gone)]
+    named = [f"{part_name(problem.labels, 'image', at)} {gone[at]} of {views[at]}" for at in worst[:NAMED]]
+    more = f" and {counted(len(worst) - NAMED, 'more image')}" if len(worst) > NAMED else ""
+    by_image = f": {', '.join(named)}{more}" if named else ""
+    lost = part_names(problem.labels, "image", solution.set_aside, NAMED)
+    lost = f"; nothing fits {lost}, whose pose stays as it was" if lost else ""
+    return [f"note: rejected {gone.sum()} of {counted(count, 'observation')}{by_image}{lost}"]
 
 
 def without_weight(solution: Solution, loss: Loss) -> list[str]:

@@ -9,19 +9,17 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-import jax
-import numpy as np
-
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import set_aside
+from jaxba.results.consecutive import Consecutive
 from jaxba.results.retriangulate import Retriangulation, retriangulate_without
 from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.drivers import Callback, IterationRecord, Watch
+from jaxba.solver.drivers import Callback, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
-from jaxba.solver.solve import Solution, solve_without
+from jaxba.solver.solve import Solution
 
 MAX_ROUNDS = 5
 """Most retriangulations. Source: COLMAP, ba_global_max_refinements."""
@@ -57,50 +55,23 @@ def solve_and_retriangulate(
     options = checked_options(options)
     callback, compiling = shown(callback, verbose)
     away = set_aside(problem)
-    before, stopped = (0, 0.0), False
-
-    def of_all(record: IterationRecord) -> IterationRecord:
-        return record._replace(iteration=record.iteration + before[0], time_s=record.time_s + before[1])
-
-    def forward(record: IterationRecord) -> bool:
-        nonlocal stopped
-        stopped = callback is not None and bool(callback(of_all(record)))
-        return stopped
-
-    watch_all = None if watch is None else lambda record, now: watch(of_all(record), now)
-
-    # a solve with a callback runs from Python, so that all limits use the same programs
-    hooks = {"callback": forward, "watch": watch_all, "compiling": compiling}
-    limited = lambda limit: replace(options, max_iterations=limit)
-    run = lambda problem, limit: solve_without(away, problem, policy, limited(limit), **hooks)
-    solution = run(problem, options.max_iterations)
+    solves = Consecutive(policy, callback, watch, compiling)
+    run = lambda problem, limit: solves.solve(away, problem, replace(options, max_iterations=limit), problem)
+    run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
-        if stopped or not solution.converged or solution.iterations == options.max_iterations:
+        solution = solves.total
+        if solves.stopped or not solution.converged or solution.iterations == options.max_iterations:
             break
         started = time.perf_counter()
         with CompileClock() as clock:
             found = retriangulate_without(away, solution.problem, options.loss)
         seconds = time.perf_counter() - started - clock.seconds
-        solution = replace(solution, total_s=solution.total_s + seconds, compile_s=solution.compile_s + clock.seconds)
+        last = solves.done[-1]
+        taken = {"total_s": last.total_s + seconds, "compile_s": last.compile_s + clock.seconds}
+        solves.done[-1] = replace(last, **taken)
         if on_search:
             on_search(found)
         if not found.pays(options.tolerances.ftol):
             break
-        before = solution.iterations, solution.total_s
-        solution = _joined(solution, run(found.problem, options.max_iterations - solution.iterations))
-    return solution
-
-
-def _joined(before: Solution, last: Solution) -> Solution:
-    """The solution of two consecutive solves together."""
-    return replace(
-        last,
-        initial_cost=before.initial_cost,
-        iterations=before.iterations + last.iterations,
-        accepted=before.accepted + last.accepted,
-        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
-        setup_s=before.setup_s + last.setup_s,
-        compile_s=before.compile_s + last.compile_s,
-        total_s=before.total_s + last.total_s,
-        quick_iterations=before.quick_iterations + last.quick_iterations,
-    )
+        run(found.problem, options.max_iterations - solution.iterations)
+    return solves.total

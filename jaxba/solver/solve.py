@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState, StepInfo
@@ -89,12 +89,16 @@ class Solution(ArrayRecord):
     lenses_free: bool = True
     """Whether `SolveOptions.intrinsics` were."""
 
+    rejected: Bool[np.ndarray, " observations"] | None = None
+    """Wrong matches that `solve_graduated` found, which count in no cost; None of other solves."""
+
     @property
     def num_residuals(self) -> int:
         """Number of residuals: two of each observation, and those of other residuals' rows."""
         own = sum(len(rows) * rows.size for rows in self.problem.residuals.rows)
-        away = int(np.isin(self.problem.camera_index, self.set_aside).sum()) if len(self.set_aside) else 0
-        return 2 * (self.problem.num_observations - away) + own
+        away = np.isin(self.problem.camera_index, self.set_aside)
+        away |= False if self.rejected is None else self.rejected
+        return 2 * int(np.sum(~away)) + own
 
     @property
     def num_parameters(self) -> int:

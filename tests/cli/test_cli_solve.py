@@ -18,7 +18,17 @@ import pytest
 import support
 from support import solve
 
-from jaxba import Refinement, SolveOptions, read_bal, read_problem, write_bal, write_bundler
+from jaxba import (
+    Refinement,
+    SceneConfig,
+    SolveOptions,
+    random_scene,
+    read_bal,
+    read_problem,
+    write_bal,
+    write_bundler,
+    write_problem,
+)
 from jaxba.cli import table
 from jaxba.cli.solve import Arguments, run, solve_options, with_settings
 from jaxba.io import json_lines
@@ -538,3 +548,19 @@ def test_errors_of_the_parser_are_one_line_with_status_2_and_print_nothing_on_st
 def test_the_parser_proposes_the_nearest_option(capsys):
     assert run(["--polcy", "ceres"]) == 2
     assert capsys.readouterr().err.endswith("perhaps you meant --policy\n")
+
+
+def test_reject_notes_wrong_matches_by_image_and_leaves_them_out_of_the_model(tmp_path, capsys):
+    scene = random_scene(SceneConfig(cameras=12, points=400, mean_track=6.0, trajectory="orbit"), 1)
+    wrong = np.random.default_rng(0).random(scene.num_observations) < 0.2
+    pixels = np.where(wrong[:, None], np.random.default_rng(1).uniform(-300, 300, (len(wrong), 2)), scene.observations)
+    write_problem(scene.replace(observations=pixels), f"{tmp_path}/model/")
+    arguments = [str(tmp_path / "model"), "--reject", "--compilation", "quick", "--output"]
+    assert run([*arguments, str(tmp_path / "out")]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: rejected ")]
+    left = read_problem(tmp_path / "out").num_observations
+    assert len(notes) == 1
+    assert re.match(rf"note: rejected {len(wrong) - left} of {len(wrong)} observations: image \d+ \(", notes[0])
+    assert left == pytest.approx((~wrong).sum(), rel=0.03)
+    assert run([*arguments, str(tmp_path / "out.txt"), "--retriangulate"]) == 2
+    assert "exclude each other" in capsys.readouterr().err

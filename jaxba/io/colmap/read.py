@@ -33,6 +33,7 @@ class Assembled(NamedTuple):
     problem: BundleProblem
     images: list[Image]  # those of the problem's cameras
     points: Int[np.ndarray, " points"]  # positions in `model.points`
+    keys: Int[np.ndarray, " observations"]  # key-points of the observations, by their positions in their images
     notes: list[str]  # what was left out or mended, one line each
 
 
@@ -105,10 +106,11 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     notes += counted(model.file("images"), blind, "image", "left out, without observations")
     notes += counted(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
     notes += counted(model.file("rigs"), other, "sensor", "left out, no camera", name)
+    keys = views[1] - table.first_key[views[0]]
     views = np.stack([(np.cumsum(sees) - 1)[views[0]], views[1], (np.cumsum(observed) - 1)[views[2]]])
     points = table.order[observed]
     problem = _problem(model, seeing, points, table.keys["xy"], views, refine_principal_point=refine_principal_point)
-    return Assembled(problem, seeing, points, notes)
+    return Assembled(problem, seeing, points, keys, notes)
 
 
 def _hints(model: Model) -> list[str]:

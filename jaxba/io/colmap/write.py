@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.io.colmap import model as records
 from jaxba.io.colmap.files import has_parts, read_model, write_model
@@ -21,12 +21,19 @@ from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 from jaxba.problem.hold import every_lens
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import part_name
+from jaxba.problem.preprocess import MIN_TRACK
 
 _NAME_DIGITS = 4  # at least, so that the names of images sort as their ids do
 _LARGEST_HALF = 2**30  # pixels; COLMAP's sizes are whole numbers, and no image is larger
 
 
-def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None = None) -> None:
+def write_colmap(
+    problem: BundleProblem,
+    folder: StrPath,
+    like: StrPath | None = None,
+    *,
+    rejected: Bool[np.ndarray, " observations"] | None = None,
+) -> None:
     """Writes a problem as a COLMAP model.
 
     All files are first written to a hidden folder; then each replaces the old one whole. They are binary, or text where
@@ -41,8 +48,14 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     Its image size is made up: the smallest even one that holds all its pixels around the centre, its principal point.
     Other lenses keep their pixels, models and numbers. Weights, and what is constant, cannot be stored.
 
-    Raises ProblemError: another model's problem, unstorable, different intrinsics of a camera, unwritable folder."""
+    `rejected` are observations that `read_colmap` made of the other model (`Solution.rejected`): they leave the tracks,
+    and their key-points have no point. Points with fewer than two observations left are dropped.
+
+    Raises ProblemError: another model's problem, unstorable, different intrinsics of a camera, unwritable folder.
+    Raises ValueError: `rejected` without another model, or of another length."""
     if like is None:
+        if rejected is not None:
+            raise ValueError("rejected is for a model that is like another one: write problem.subset(~rejected)")
         write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
     model, target = read_model(like), display_name(folder)
@@ -51,11 +64,14 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     old = assembled.problem
     if (problem.num_cameras, problem.num_points) != (old.num_cameras, old.num_points):
         raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(like)}")
+    gone = np.zeros(old.num_observations, bool) if rejected is None else np.asarray(rejected)
+    if gone.shape != (old.num_observations,):
+        raise ValueError(f"rejected must have {old.num_observations} entries, has shape {gone.shape}")
     text = model.suffix == ".txt" and not has_parts(folder, ".bin")  # COLMAP ignores text files beside a binary model
     _check_finite(model, assembled, problem, target)
     model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
     model = _with_poses(_with_places(model, assembled, problem), assembled, problem)
-    model = _with_points(model, assembled, problem)
+    model = _without(_with_points(model, assembled, problem, ~gone), assembled, gone)
     write_model(_with_rigs(model), folder, ".txt" if text else ".bin")
 
 
@@ -68,16 +84,42 @@ def _check_finite(model: Model, assembled: Assembled, problem: BundleProblem, ta
             raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
 
 
-def _with_points(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
-    """The model with the points of the problem, and their errors."""
+def _with_points(
+    model: Model, assembled: Assembled, problem: BundleProblem, kept: Bool[np.ndarray, " observations"]
+) -> Model:
+    """The model with the points of the problem, and their errors by the observations that are kept."""
     heads = model.points.copy()
     heads["xyz"][assembled.points] = problem.points
     names = ("observations", "camera_index", "point_index")  # all of the model, of which some may not have counted
-    problem = problem.replace(**{name: getattr(assembled.problem, name) for name in names})
+    problem = problem.replace(**{name: getattr(assembled.problem, name)[kept] for name in names}, whitening=None)
     with np.errstate(over="ignore", invalid="ignore"):
         difference = geometry.project(problem) - np.asarray(problem.observations)
     heads["error"][assembled.points] = mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
     return replace(model, points=heads)
+
+
+def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observations"]) -> Model:
+    """The model without some of its observations, and without the points that then have too few."""
+    if not gone.any():
+        return model
+    problem, images, heads = assembled.problem, dict(model.images), model.points
+    ids = np.array([image.id for image in assembled.images])[problem.camera_index]
+    code = lambda image, key: np.asarray(image, np.uint64) << np.uint64(32) | np.asarray(key, np.uint64)
+    point = np.repeat(np.arange(len(heads)), heads["length"].astype(np.int64))
+    elements = model.tracks
+    cut = np.isin(code(elements["image"], elements["key"]), code(ids, assembled.keys)[gone])
+    touched = np.union1d(point[cut], assembled.points[problem.point_index[gone]])
+    left = np.bincount(point[~cut], minlength=len(heads))
+    drop = np.zeros(len(heads), bool)
+    drop[touched] = left[touched] < MIN_TRACK
+    for image in images.values():
+        keys = image.keys.copy()
+        keys["point"][assembled.keys[gone & (ids == image.id)]] = records.NO_POINT
+        keys["point"][np.isin(keys["point"], heads["id"][drop])] = records.NO_POINT
+        images[image.id] = replace(image, keys=keys)
+    heads = heads.copy()
+    heads["length"] = left
+    return replace(model, images=images, points=heads[~drop], tracks=elements[~cut & ~drop[point]])
 
 
 def _new_cameras(

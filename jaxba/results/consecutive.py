@@ -1,0 +1,82 @@
+"""Several solves of one problem, one after the other, that look like one from outside."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxba.damping import DampingPolicy
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.solver.drivers import Callback, IterationRecord, Watch
+from jaxba.solver.options import SolveOptions
+from jaxba.solver.solve import Solution, solve_without
+
+
+class Consecutive:
+    """Solves with one policy. Callback and watch count iterations and seconds over all of them."""
+
+    stopped = False
+    """Whether the callback has asked to stop."""
+
+    def __init__(
+        self,
+        policy: str | DampingPolicy,
+        callback: Callback | None,
+        watch: Watch | None,
+        compiling: Callable[[], AbstractContextManager],
+    ) -> None:
+        self._policy, self._callback, self._watch, self._compiling = policy, callback, watch, compiling
+        self.done: list[Solution] = []
+
+    @property
+    def total(self) -> Solution:
+        """All solves together."""
+        return functools.reduce(joined, self.done)
+
+    def solve(
+        self, away: Int[np.ndarray, " away"], problem: BundleProblem, options: SolveOptions, whole: BundleProblem
+    ) -> Solution:
+        """`solve_without`; who watches sees the parameters in `whole`. It runs from Python, so that all limits use the
+        same programs."""
+        count, seconds = sum(one.iterations for one in self.done), sum(one.total_s for one in self.done)
+        watch = self._watch
+
+        def of_all(record: IterationRecord) -> IterationRecord:
+            return record._replace(iteration=record.iteration + count, time_s=record.time_s + seconds)
+
+        def forward(record: IterationRecord) -> bool:
+            self.stopped = bool(self._callback and self._callback(of_all(record)))
+            return self.stopped
+
+        seen = watch and (lambda record, now: watch(of_all(record), lambda: with_parameters(whole, now())))
+        hooks = {"callback": forward, "watch": seen, "compiling": self._compiling}
+        found = solve_without(away, problem, self._policy, options, **hooks)
+        self.done.append(found)
+        return found
+
+
+def with_parameters(problem: BundleProblem, found: BundleProblem) -> BundleProblem:
+    """The problem with the parameters of another one, of other observations."""
+    names = ("cameras", "points", "rigs", "residuals")
+    return problem.replace(**{name: getattr(found, name) for name in names})
+
+
+def joined(before: Solution, last: Solution) -> Solution:
+    """The solution of two consecutive solves together."""
+    return replace(
+        last,
+        initial_cost=before.initial_cost,
+        iterations=before.iterations + last.iterations,
+        accepted=before.accepted + last.accepted,
+        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
+        setup_s=before.setup_s + last.setup_s,
+        compile_s=before.compile_s + last.compile_s,
+        total_s=before.total_s + last.total_s,
+        quick_iterations=before.quick_iterations + last.quick_iterations,
+    )
