@@ -2,8 +2,7 @@
 
 Angle-axis vectors are in radians. The host uses SciPy's `Rotation`.
 
-Source: Sola et al. 2018, "A micro Lie theory", eqs. 143-146.
-"""
+Source: Sola et al. 2018, "A micro Lie theory", eqs. 143-146."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Charts of a page in the words of plotly.js: lines over one of several x axes, and the charts of a benchmark.
 
-A trace's `meta` is the chip that hides it; `x` and `y` are `{axis: values}` by the switch, or the same for all.
-"""
+A trace's `meta` is the chip that hides it; `x` and `y` are `{axis: values}` by the switch, or the same for all."""
 
 from __future__ import annotations
 

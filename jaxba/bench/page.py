@@ -1,7 +1,6 @@
 """One HTML page with interactive charts and sortable tables that opens without a server and fetches nothing.
 
-It holds plotly.js: 4.8 MB. By its Content-Security-Policy it loads nothing but its own text and pictures it makes.
-"""
+It holds plotly.js: 4.8 MB. By its Content-Security-Policy it loads nothing but its own text and pictures it makes."""
 
 from __future__ import annotations
 

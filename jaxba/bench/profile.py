@@ -5,8 +5,7 @@ accepted or rejected. A target that is never reached has infinite time and itera
 median, so that a solver that fails in at least half of its repeats counts as failed.
 
 Source: performance profiles of rootba (Demmel et al. 2021, after Dolan and Moré 2002), with one change: problems that
-no solver finishes stay in the denominator.
-"""
+no solver finishes stay in the denominator."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 A mean over the problems on which a target was reached is always given with the number k of these problems, out of all n
 problems of the benchmark. Iterations also have a capped mean over all n problems, in which a target that was not
-reached counts as `ITERATION_LIMIT`, so that a solver cannot improve its mean by failing on hard problems.
-"""
+reached counts as `ITERATION_LIMIT`, so that a solver cannot improve its mean by failing on hard problems."""
 
 from __future__ import annotations
 

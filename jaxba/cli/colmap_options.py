@@ -1,7 +1,6 @@
 """COLMAP's names of options, as those of `jaxba-solve`.
 
-Source: COLMAP 4.2, `colmap bundle_adjuster --help`; `BundleAdjustment.*` is COLMAP 3's.
-"""
+Source: COLMAP 4.2, `colmap bundle_adjuster --help`; `BundleAdjustment.*` is COLMAP 3's."""
 
 from __future__ import annotations
 

@@ -50,8 +50,7 @@ def run_command(
         main: gets the parsed arguments and returns the exit status.
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
-        subcommand: for the help, if `argv` is without it.
-    """
+        subcommand: for the help, if `argv` is without it."""
     with Interrupt() as interrupt, tolerant_streams():
         try:
             program = f"jaxba-{arguments.__module__.rpartition('.')[2]} {subcommand}".strip()
@@ -183,8 +182,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
 def _remove_damaged_programs(folder: Path) -> None:
     """From now on removes cached programs that JAX cannot read: it neither replaces them nor stops to warn of them.
 
-    A process that is killed while it writes one, or a full disk, leaves a part of it (JAX 0.12).
-    """
+    A process that is killed while it writes one, or a full disk, leaves a part of it (JAX 0.12)."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, *where: Any, **named: Any) -> None:

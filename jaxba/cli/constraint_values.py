@@ -1,7 +1,6 @@
 """Values in the file of `--constraints`: what each key may hold, with one line in the file's own words if it does not.
 
-The file is read as text alone: `000010` is a name, and a number where a number is meant.
-"""
+The file is read as text alone: `000010` is a name, and a number where a number is meant."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ def names_of(names: Sequence[str]) -> str:
 def meant(items: Sequence[str], names: Container[str] = ()) -> list[Any]:
     """What items of the file mean: of each text a name if there is such a one, else an id or a position.
 
-    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules.
-    """
+    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules."""
     plain = lambda one: one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
     return [int(one) if plain(one) else one for one in items]
 

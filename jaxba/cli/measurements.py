@@ -33,8 +33,7 @@ def with_measured(problem: BundleProblem, where: str, key: str, value: Any, stri
     """The problem with what a key of `MEASURED` says.
 
     What is measured of images and points that the problem does not have is left out with a note that begins with
-    `where`, or refused if `strict`. Raises ValueError: something that the value cannot be; one line.
-    """
+    `where`, or refused if `strict`. Raises ValueError: something that the value cannot be; one line."""
     if key == "depths":
         return _with_depths(problem, where, value, strict)
     kind, what, loss = "point" if key in ("control_points", "distances") else "image", "pairs", None
@@ -100,8 +99,7 @@ def leave_out(where: str, what: str, names: list[str], strict: bool) -> None:
 def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -> BundleProblem:
     """Depths from maps of the size of their images, each with a scale, at first the median, and a shift, at first 0.
 
-    Of a BAL lens, whose pixels do not say where the image is, the principal point is the middle of the map.
-    """
+    Of a BAL lens, whose pixels do not say where the image is, the principal point is the middle of the map."""
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
     if not isinstance(value["folder"], str):
         raise ValueError(f"folder: must be a name, not {value['folder']}")

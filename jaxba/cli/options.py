@@ -30,8 +30,7 @@ def options(cls: type[Arguments]) -> type[Arguments]:
 
     The text below a field is its help, whatever the lengths of its lines. A text in the annotation,
     `Annotated[str, "FILE"]`, stands for the value in the help. A class that inherits from several such classes has
-    their options, in the help a group for each class.
-    """
+    their options, in the help a group for each class."""
     texts, hints = _texts(cls), get_type_hints(cls, include_extras=True)
     for name in cls.__annotations__:
         default = getattr(cls, name, None)
@@ -88,8 +87,7 @@ def parse(
         program: name of the command.
         argv: the command line; `sys.argv[1:]` if None.
         defaults: values by name of options that the command line may leave out, in place of the class's own. For a
-            class that inherits its options.
-    """
+            class that inherits its options."""
     groups = [base for base in arguments.__bases__ if is_dataclass(base)]
     # subclasses, without the docstrings, which tyro would print
     parts = []
@@ -113,8 +111,7 @@ def _error(drawn: str) -> str:
     """The message of tyro in one line.
 
     It is a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and
-    how to get help. In an encoding that has lines the title stands in the first rule, and lines are its border.
-    """
+    how to get help. In an encoding that has lines the title stands in the first rule, and lines are its border."""
     text = _COLORS.sub("", drawn)
     parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
     message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text

@@ -13,8 +13,7 @@ class Devices:
     """Devices and processes among which the work is divided."""
 
     devices: int | None = None
-    """Devices of each process, among which the work is divided. On a CPU they are virtual: no speed-up. Default: 1;
-    with several processes, all of them."""
+    """Devices of each process, on a CPU virtual ones: no speed-up. Default: 1; with several processes, all."""
 
     coordinator: Annotated[str | None, "HOST:PORT"] = None
     """Address of process 0, which reads, writes and prints. Start every process with the same options but --process."""

@@ -82,7 +82,7 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
     """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
-    left_out = rejected(solution)
+    left_out, sizes = rejected(solution), (solution.num_residuals, solution.num_parameters)
     if solution.rejected is None:
         problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
     else:
@@ -106,8 +106,7 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
         *by_kind,
         f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
-        f"linear solver {solution.linear_solver}; {solution.num_residuals} residuals, "
-        f"{solution.num_parameters} parameters",
+        f"linear solver {solution.linear_solver}; {sizes[0]} residuals, {sizes[1]} parameters",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]

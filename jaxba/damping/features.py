@@ -1,7 +1,6 @@
 """What an agent observes: features of the last steps and of the solve.
 
-The game and the policies share this, so that a policy observes the same in a solve as in training.
-"""
+The game and the policies share this, so that a policy observes the same in a solve as in training."""
 
 from __future__ import annotations
 

@@ -9,8 +9,7 @@ An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda
     after an overdamped step  lambda <= last lambda / 10
     after an inexact step     lambda >= last lambda
 
-After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the end of the solve.
-"""
+After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the end of the solve."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Policy files: a trained agent in one `.safetensors` file.
 
-It holds the actor's weights; its metadata are the agent's configuration and the policy's origin.
-"""
+It holds the actor's weights; its metadata are the agent's configuration and the policy's origin."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Hand-written damping rules. What lambda multiplies is `Coordinates.scaling`.
 
-Formulas and sources are in the docstring of each class.
-"""
+Formulas and sources are in the docstring of each class."""
 
 from __future__ import annotations
 

@@ -9,8 +9,7 @@
 | truncated | never |
 | reward | `GameConfig.reward` |
 
-Everything is traced once. An episode that ends is followed by one on a random scene of the bank.
-"""
+Everything is traced once. An episode that ends is followed by one on a random scene of the bank."""
 
 from __future__ import annotations
 

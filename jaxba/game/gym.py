@@ -1,7 +1,6 @@
 """The game as Gymnasium environments, for trainers that speak NumPy. Needs the extra `gym`.
 
-`GymVectorGame` steps all scenes in one compiled call and resets those that ended; `GymGame` has one scene.
-"""
+`GymVectorGame` steps all scenes in one compiled call and resets those that ended; `GymGame` has one scene."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Plays a damping policy on every scene of a bank, many at a time, each to its end.
 
 A compiled loop over lanes: when a scene ends, its lane starts the next one, so that no lane waits for the slowest
-scene.
-"""
+scene."""
 
 from __future__ import annotations
 
@@ -109,8 +108,7 @@ def play(
         policy: chooses lambda; a pytree, so that policies of one class share a program.
         options: of the steps.
         limit: largest number of linear solves per scene.
-        ftol: relative decrease of an accepted step below which a scene has converged (`converged_in_cost`).
-    """
+        ftol: relative decrease of an accepted step below which a scene has converged (`converged_in_cost`)."""
     check_x64(bank.initial_cost.dtype)
     played = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
     found: Trajectories = jax.tree.map(np.asarray, played)

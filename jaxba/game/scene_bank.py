@@ -2,8 +2,7 @@
 
 Scenes are made in one compiled program and solved by a portfolio of hand-written rules with embedded point iterations.
 Those that no rule solves, that are solved at the start or that are numerically meaningless are left out. Reaching the
-best known cost ends an episode in training. No observation of a policy depends on it.
-"""
+best known cost ends an episode in training. No observation of a policy depends on it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Statistics of solvers or policies on problems, for games, trainings, benchmarks and the paper.
 
 Pure functions of arrays with an entry per problem or scene. Iterations and seconds to a target are infinite if it is
-never reached. Ratios are ours / theirs, so that below 1 is better.
-"""
+never reached. Ratios are ours / theirs, so that below 1 is better."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 Visibility, noise, wrong matches and starts are those of the problem. Many real problems begin near their end, so half
 of the windows begin where random scenes do: cameras and points are moved by the same random amounts.
-Every camera has a lens of its own, also where the problem shares lenses or keeps them constant.
-"""
+Every camera has a lens of its own, also where the problem shares lenses or keeps them constant."""
 
 from __future__ import annotations
 

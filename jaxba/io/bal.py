@@ -2,8 +2,7 @@
 
 The numbers, separated by any whitespace, are: the counts of cameras, points and observations; for each observation its
 camera, its point, and its x and y in pixels; for each camera 9 numbers; for each point 3. Covariances cannot be stored.
-Source: Agarwal et al. 2010, https://grail.cs.washington.edu/projects/bal/
-"""
+Source: Agarwal et al. 2010, https://grail.cs.washington.edu/projects/bal/"""
 
 from __future__ import annotations
 

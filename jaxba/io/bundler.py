@@ -1,8 +1,7 @@
 """Bundler models (`bundle.out`, version 0.3): cameras with rotation matrices, and for each point the views of it.
 
 The camera is BAL's: it looks down -z and `z = f (1 + k1 |p|^2 + k2 |p|^4) p` with `p = -P.xy / P.z`, pixels from the
-image centre, y upwards. Source: Snavely, "Bundler v0.4 User's Manual", https://www.cs.cornell.edu/~snavely/bundler/
-"""
+image centre, y upwards. Source: Snavely, "Bundler v0.4 User's Manual", https://www.cs.cornell.edu/~snavely/bundler/"""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 A line of poses has 12 numbers, a 3 x 4 matrix row by row; line 0 is frame 0 (KITTI's odometry benchmark). Lines of 13
 or 17 numbers begin with the frame and have 3 x 4 or 4 x 4 numbers (KITTI-360's `poses.txt`, `cam0_to_world.txt`);
-frames may be missing. Source: the readmes of both development kits.
-"""
+frames may be missing. Source: the readmes of both development kits."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Files of one JSON object per line, as dataclasses of numbers, texts, tuples and further dataclasses.
 
-Numbers that are not finite are written as null, which is read as NaN. A killed run leaves half a line at most.
-"""
+Numbers that are not finite are written as null, which is read as NaN. A killed run leaves half a line at most."""
 
 from __future__ import annotations
 

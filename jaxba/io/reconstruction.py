@@ -1,8 +1,7 @@
 """pycolmap's objects as problems, and what was found back into them.
 
 A `pycolmap.Reconstruction` is written to a temporary folder and read as every COLMAP model is. Source: COLMAP 4.2,
-`BundleAdjustmentOptions`, `BundleAdjustmentConfig`.
-"""
+`BundleAdjustmentOptions`, `BundleAdjustmentConfig`."""
 
 from __future__ import annotations
 

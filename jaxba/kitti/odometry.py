@@ -2,8 +2,7 @@
 
 The relative pose of two views with enough parallax comes from an essential matrix, and their tracks are triangulated.
 The pose of every other view comes from the known points that it sees (PnP), and new points are triangulated as soon as
-the angle between their rays is large enough. The first baseline has length 1. Nothing is adjusted afterwards.
-"""
+the angle between their rays is large enough. The first baseline has length 1. Nothing is adjusted afterwards."""
 
 from __future__ import annotations
 

@@ -11,8 +11,7 @@ Calibration is read in the forms that KITTI's releases and their relatives have:
 | `K.txt` | a 3 x 3 matrix, or one of 3 x 4 |
 
 Source: Geiger et al. 2012, "Are we ready for autonomous driving?", 2013, "Vision meets robotics"; Liao et al. 2022,
-"KITTI-360"; the readmes of the development kits.
-"""
+"KITTI-360"; the readmes of the development kits."""
 
 from __future__ import annotations
 

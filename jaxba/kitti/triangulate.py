@@ -1,7 +1,6 @@
 """Triangulation of many tracks at once, from cameras with known poses.
 
-Cameras here look down +z: a point `X` of the world is at `R X + t`, and its ray is `(x / z, y / z)`.
-"""
+Cameras here look down +z: a point `X` of the world is at `R X + t`, and its ray is `(x / z, y / z)`."""
 
 from __future__ import annotations
 

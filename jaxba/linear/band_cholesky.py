@@ -4,8 +4,7 @@ A window of as many tiles as the band is wide slides down the diagonal. Each ste
 tiles below, subtracts their outer product from the rest of the window, and moves on by one row of tiles. The compiled
 program has one loop body, whatever the length of the sequence.
 
-Source: Golub and Van Loan, "Matrix Computations", section 4.3 (band Cholesky), blocked as LAPACK's pbtrf.
-"""
+Source: Golub and Van Loan, "Matrix Computations", section 4.3 (band Cholesky), blocked as LAPACK's pbtrf."""
 
 from __future__ import annotations
 

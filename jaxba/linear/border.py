@@ -9,8 +9,7 @@ their cameras. In `T^T S T` the shared lenses are the last rows and columns:
 A is S without the lenses of cameras that share theirs. It keeps the band or blocks of S, so that it is factored like
 S; then `(C - B^T A^-1 B) y_L = b_L - B^T A^-1 b_A`. The columns `S T_L` are products with S that do not form it.
 
-Source: bordered systems as in Golub and Van Loan, "Matrix Computations", section 3.2.11 (block elimination).
-"""
+Source: bordered systems as in Golub and Van Loan, "Matrix Computations", section 3.2.11 (block elimination)."""
 
 from __future__ import annotations
 

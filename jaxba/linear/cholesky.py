@@ -3,8 +3,7 @@
 On a CPU, large systems are factored in panels whose updates are matrix products. XLA runs these on all cores, while
 LAPACK is limited to one (`process.single_blas_thread` says why). The diagonal block of a panel is inverted, so that the
 rows below it are a product too. Source: Golub and Van Loan, "Matrix Computations", section 4.2.9
-(blocked left-looking Cholesky); inverted diagonal blocks as in MAGMA's trsm.
-"""
+(blocked left-looking Cholesky); inverted diagonal blocks as in MAGMA's trsm."""
 
 from __future__ import annotations
 

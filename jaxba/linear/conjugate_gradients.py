@@ -1,8 +1,7 @@
 """Preconditioned conjugate gradients with Ceres' stopping rule and an iteration count.
 
 `jax.scipy.sparse.linalg.cg` computes the same iterates, but returns no count and stops on the residual norm only. An
-inexact Newton step should stop on the quadratic model instead: late iterations hardly lower it.
-"""
+inexact Newton step should stop on the quadratic model instead: late iterations hardly lower it."""
 
 from __future__ import annotations
 
@@ -45,8 +44,7 @@ def conjugate_gradients(
         forcing: stop when `i (Q_i - Q_(i-1)) / Q_i < forcing`, where `Q_i = x.A x - 2 b.x = -x.(b + r)` in iteration
             i. Source: Ceres conjugate_gradients_solver, after Nash and Sofer 1990. Zero switches the test off.
         tolerance: stop when `|r| <= tolerance |b|`.
-        max_iterations: upper bound.
-    """
+        max_iterations: upper bound."""
     bound = tolerance * tolerance * jnp.sum(right * right)
 
     def body(c: _Carry) -> _Carry:

@@ -1,7 +1,6 @@
 """The reduced camera system S formed: the blocks of its lower triangle, or one dense matrix.
 
-A block is a sum over the points that two cameras both see: `S_jk -= sum_i Y_ij Y_ik^T`.
-"""
+A block is a sum over the points that two cameras both see: `S_jk -= sum_i Y_ij Y_ik^T`."""
 
 from __future__ import annotations
 

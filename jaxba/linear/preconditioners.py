@@ -4,8 +4,7 @@
 - `schur-jacobi`: the block diagonal of S.
 - `two-level`: the block diagonal of S plus a coarse correction (two_level.py).
 
-Source: Agarwal et al. 2010, "Bundle Adjustment in the Large" (the first two).
-"""
+Source: Agarwal et al. 2010, "Bundle Adjustment in the Large" (the first two)."""
 
 from __future__ import annotations
 

@@ -6,8 +6,7 @@
 - `cg`: the same, but `jax.scipy.sparse.linalg.cg` with a fixed number of iterations. Its derivatives are those of the
   solution, and reverse mode passes through it.
 
-Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
-"""
+Source: Agarwal et al. 2010, "Bundle Adjustment in the Large"."""
 
 from __future__ import annotations
 

@@ -19,8 +19,7 @@ Rotations are perturbed on the manifold, `R <- exp(d) R`; damping is diagonal in
 (`rotation_coordinates`).
 
 Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 6; Agarwal et al. 2010, "Bundle Adjustment
-in the Large", section 3.
-"""
+in the Large", section 3."""
 
 from __future__ import annotations
 

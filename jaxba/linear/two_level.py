@@ -13,8 +13,7 @@ A similarity of cameras and points together changes no pixel, so that `J_c P = -
 does not hold, and they are computed from the camera Jacobians.
 
 Source: additive two-level Schwarz with a Nicolaides coarse space (Toselli and Widlund 2005, section 3); Jian, Balcan
-and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with subgraphs and clusters instead.
-"""
+and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with subgraphs and clusters instead."""
 
 from __future__ import annotations
 

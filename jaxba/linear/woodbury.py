@@ -9,8 +9,7 @@ so that only the capacitance matrix `I - Z^T Z` is factored. It is positive defi
 are those of `L^-1 S L^-T` other than one. In effect cameras are eliminated instead of points: the operations are those
 of a Cholesky factorisation of `[[B, W], [W^T, I]]`, and as stable.
 
-Source: Golub and Van Loan, "Matrix Computations", section 2.1.4 (Sherman-Morrison-Woodbury formula).
-"""
+Source: Golub and Van Loan, "Matrix Computations", section 2.1.4 (Sherman-Morrison-Woodbury formula)."""
 
 from __future__ import annotations
 

@@ -8,8 +8,7 @@ the cost is
 and the damped step d solves `(H + D) d = -g`, where D is `lambda diag(H)` or `lambda I` (times a constant for cameras).
 linear/schur.py eliminates the points, a method (lm/method.py) solves for the cameras, and the points follow.
 
-Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4 and 6.
-"""
+Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4 and 6."""
 
 from __future__ import annotations
 

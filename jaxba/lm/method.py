@@ -1,8 +1,7 @@
 """The interface of methods, each a way to compute the step of an iteration, and plain Levenberg-Marquardt.
 
 `lm_step` calls `StepMethod.solve`. A method is a frozen dataclass, so that it can be a field of the static
-`StepOptions`; its other properties are attributes of the class. `solver/methods.py` finds methods by name.
-"""
+`StepOptions`; its other properties are attributes of the class. `solver/methods.py` finds methods by name."""
 
 from __future__ import annotations
 

@@ -11,8 +11,7 @@ without another linear solve (refinement/candidates.py). A damping policy choose
 
 `lm_step` is a pure function: it compiles once per problem shape and `StepOptions` and runs under `vmap`. It never
 branches in Python on a computed value: a failed factorisation or an overflow gives a candidate with a non-finite cost,
-which is rejected like any other bad step.
-"""
+which is rejected like any other bad step."""
 
 from __future__ import annotations
 
@@ -95,8 +94,7 @@ def lm_step(
         damping: lambda; `Coordinates.scaling` says what it multiplies.
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
-        iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
-    """
+        iteration: number of the iteration, from 0; methods with random clusters use other ones in each."""
     check_x64(state.cost.dtype)
     proposal = propose(layout, state, damping, options, iteration)
     return try_step(layout, state, damping, proposal, options, min_gain)

@@ -3,8 +3,7 @@
 Three convergence tests on accepted steps, as in Ceres (relative decrease of the cost, relative step length, largest
 gradient entry), and one on rejected steps whose predicted decrease is below the rounding error of the cost. A strongly
 damped step is short whatever the distance to the minimum, so the first two ask in addition that damping is not what
-made it short.
-"""
+made it short."""
 
 from __future__ import annotations
 

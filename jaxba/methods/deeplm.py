@@ -5,8 +5,7 @@ passes over the observations. No reduced camera system is formed: memory is line
 
 Source: Huang et al. 2021, "DeepLM: Large-scale Nonlinear Least Squares on Deep Learning Frameworks using Stochastic
 Domain Decomposition", and the authors' code. Two differences: the authors divide the columns of J by `1 + |J_j|` before
-damping, where we clamp the diagonal as Ceres does; and they recompute the residual every ten iterations.
-"""
+damping, where we clamp the diagonal as Ceres does; and they recompute the residual every ten iterations."""
 
 from __future__ import annotations
 

@@ -11,8 +11,7 @@ Lambda damps cameras, points and replicas. With a large lambda the step is nearl
 replicas of a point differ; `consensus_gradient` makes them agree.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,
-and the authors' code.
-"""
+and the authors' code."""
 
 from __future__ import annotations
 

@@ -8,8 +8,7 @@ observations. Rotation matrices are computed once per camera; what is computed p
 branch.
 
 Source of the model: Agarwal et al. 2010, "Bundle Adjustment in the Large". Derivatives by a rotation are those of the
-left perturbation `R <- exp(d) R`, Sola et al. 2018, "A micro Lie theory", eqs. 143-146.
-"""
+left perturbation `R <- exp(d) R`, Sola et al. 2018, "A micro Lie theory", eqs. 143-146."""
 
 from __future__ import annotations
 

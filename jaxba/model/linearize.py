@@ -3,8 +3,7 @@
     f = 1/2 sum_i rho(|r_i|^2),    r_i = Sigma_i^(-1/2) (predicted - observed)
 
 The robust loss enters the linear model as weights: residuals and Jacobians are scaled by `sqrt(rho'(|r_i|^2))`
-(problem/losses.py), so that `g = J^T r` is the gradient of f and `H = J^T J` its Gauss-Newton Hessian.
-"""
+(problem/losses.py), so that `g = J^T r` is the gradient of f and `H = J^T J` its Gauss-Newton Hessian."""
 
 from __future__ import annotations
 

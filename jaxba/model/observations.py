@@ -1,7 +1,6 @@
 """Evaluation of functions of an observation, its camera and its point: per slot, and summed over each point.
 
-The functions are written once, for a `Views`; here they are evaluated in one fused loop over all slots.
-"""
+The functions are written once, for a `Views`; here they are evaluated in one fused loop over all slots."""
 
 from __future__ import annotations
 

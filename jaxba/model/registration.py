@@ -46,8 +46,7 @@ def with_residual(
         rows: a residual called with its indices and data.
         loss: robust loss of the squared norm of a row; None: squared.
         unknowns: start of each new block by its name, shape (n, numbers): a row for each camera, or fewer, which
-            several cameras have in common. `Solution.problem.residuals` has their values after a solve.
-    """
+            several cameras have in common. `Solution.problem.residuals` has their values after a solve."""
     if not isinstance(rows, Rows):
         raise ValueError(f"rows must be those of a residual, called with indices and data, not {shown(rows)}")
     if not isinstance(loss, Loss | None) or not isinstance(unknowns, Mapping | None):

@@ -3,8 +3,7 @@
 Functions see poses and points as they were when the residuals were registered (`Rows.scale`), a row at a time. They are
 differentiated backwards, number by number, as operations on vectors over all rows (model/vectors.py); what has no rule
 there JAX maps over the rows, backwards or, where it cannot be transposed, forwards. Derivatives are in the coordinates
-of the camera Jacobian (model/linearize.py).
-"""
+of the camera Jacobian (model/linearize.py)."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 JAX can map such a function over rows itself (`jax.vmap`), but then reading a number of an array is a slice of an array
 over rows, and stacking numbers copies them, which XLA does not fuse and whose transposes are pads. Here the function
-is traced once, and what only moves numbers about disappears.
-"""
+is traced once, and what only moves numbers about disappears."""
 
 from __future__ import annotations
 

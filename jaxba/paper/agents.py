@@ -1,8 +1,7 @@
 """The trained agents that the tables compare: the paper's as printed and as tuned, the best one for lambda alone, and
 those of the ablations, which change one setting of the tuned one; all on the same scenes.
 
-Each agent is trained in its own folder inside the folder of the run. An interrupted training continues there.
-"""
+Each agent is trained in its own folder inside the folder of the run. An interrupted training continues there."""
 
 from __future__ import annotations
 

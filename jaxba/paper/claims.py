@@ -1,8 +1,7 @@
 """Tests by fixed rules whether the results of a run reproduce the paper's claims.
 
 A claim is about a ratio (our method takes a fifth of classic's iterations), an order (five errors are better than one)
-or a fraction (all solves succeed). The report states the rules (`criterion` in texts.md).
-"""
+or a fraction (all solves succeed). The report states the rules (`criterion` in texts.md)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Configuration of a reproduction run, and its YAML files.
 
 A file in `configs/paper` states differences to the file that it extends, or to the defaults of the classes
-(jaxba/settings/configurations.py).
-"""
+(jaxba/settings/configurations.py)."""
 
 from __future__ import annotations
 

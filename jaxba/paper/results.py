@@ -4,8 +4,7 @@
 whole set of small scenes, a line for each policy and seed. A killed run loses at most the line that it was writing.
 
 Means are arithmetic, as the paper's "average", and a failure counts as 100 iterations. The mean over the problems is
-taken for each training run; `low` and `high` are the extremes of these means.
-"""
+taken for each training run; `low` and `high` are the extremes of these means."""
 
 from __future__ import annotations
 

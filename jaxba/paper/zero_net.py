@@ -4,8 +4,7 @@ Its input is the same history as the agent's (the last states, actions and rewar
 gradient is that of the cost after one step, through the differentiable `lm_step`. It is trained when a table needs it.
 
 The next cost depends on the network through lambda only, so the gradient is a product of two factors. The derivative of
-the cost by the action is in forward mode, a number per scene: a failed factorisation spoils only one.
-"""
+the cost by the action is in forward mode, a number per scene: a failed factorisation spoils only one."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Solves with Ceres under its own trust-region rule, and what this shares with `driven.py`. Needs the extra `ceres`.
 
 The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function ignores, are counted
-(see `colmap.py`).
-"""
+(see `colmap.py`)."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 The cost function is C++, so that Ceres does not call Python in its inner loops. The camera model is COLMAP's RADIAL
 with parameters `[f, cx, cy, k1, k2]`, and the pose `[quaternion xyzw, translation]` is one parameter block. COLMAP's
-camera looks along +z with y downwards: it is BAL's camera rotated by pi about x.
-"""
+camera looks along +z with y downwards: it is BAL's camera rotated by pi about x."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@ these times are comparable with each other only.
 
 Ceres itself accepts every step: its problem has an additional residual (`_AcceptAnyStep`) that no parameter changes,
 large before a step and zero after it. jaxba then refines the step if that is asked for, and accepts or rejects it as it
-does its own, and Ceres continues from the result.
-"""
+does its own, and Ceres continues from the result."""
 
 from __future__ import annotations
 

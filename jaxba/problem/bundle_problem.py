@@ -1,7 +1,6 @@
 """The bundle adjustment problem: parameters, observations, and the checks that they are valid.
 
-A `BundleProblem` made by `BundleProblem.create` is finite, has observations, and indices in range.
-"""
+A `BundleProblem` made by `BundleProblem.create` is finite, has observations, and indices in range."""
 
 from __future__ import annotations
 
@@ -47,8 +46,7 @@ class BundleProblem(ArrayRecord):
     With lenses of other camera models (`jaxba.CAMERA_MODELS`) a camera is `[w, t, numbers]`, and z the model's pixel of
     the point (P.x, -P.y, -P.z): poses look down -z as BAL's do, and pixels are those of the model.
 
-    Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
-    """
+    Source: Agarwal et al. 2010, "Bundle Adjustment in the Large"."""
 
     cameras: Float[AnyArray, "cameras parameters"]
     """Angle-axis (radians), translation (scene units), and the lens: f (pixels), k1 and k2, or the numbers of its
@@ -117,8 +115,7 @@ class BundleProblem(ArrayRecord):
                 residual, like the covariance `I / weight`. Excludes `covariance`.
             lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
             constants: optional; poses and points that are not optimised.
-            rigs: optional; cameras that move together.
-        """
+            rigs: optional; cameras that move together."""
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
         parts = {"lenses": (lenses, Lenses), "constants": (constants, Constants), "rigs": (rigs, Rigs)}

@@ -6,8 +6,7 @@ JAX, elementwise over arrays of any shape; its derivatives come by forward mode 
 Perspective models project to `(u, v) = (x, y) / z`. Fisheye models project to `theta (x, y) / r` with
 `r^2 = x^2 + y^2` and `theta = atan2(r, z)`. Both then distort (u, v) and map it to `(fx u + cx, fy v + cy)`.
 
-Source: COLMAP 4.2, src/colmap/sensor/models.h, whose names, numbers and order of parameters these are.
-"""
+Source: COLMAP 4.2, src/colmap/sensor/models.h, whose names, numbers and order of parameters these are."""
 
 from __future__ import annotations
 

@@ -5,8 +5,7 @@ a residual and a slope like any other, but no step leads from there to the front
 iterations bring points back. An image that is turned round pulls all others after it.
 
 Half of the views is a border with room on both sides. Measured: starts of random scenes twelve times as far away as
-usual have at most 13% of an image's views behind it, Ladybug-49 1.2%, images turned by 100 degrees 66% or more.
-"""
+usual have at most 13% of an image's views behind it, Ladybug-49 1.2%, images turned by 100 degrees 66% or more."""
 
 from __future__ import annotations
 

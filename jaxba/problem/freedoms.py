@@ -6,8 +6,7 @@ The cost of pixels does not change when the whole scene is moved, turned and sca
 
 Constants, rigs, priors and other residuals leave those combinations of the seven that keep each constant number and
 each residual.
-A point whose rays are all parallel, as one that is seen once, can move along them.
-"""
+A point whose rays are all parallel, as one that is seen once, can move along them."""
 
 from __future__ import annotations
 

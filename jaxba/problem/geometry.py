@@ -1,8 +1,7 @@
 """The BAL camera on the host: rotations, centres, projection and cost in float64 NumPy.
 
 Readers, scene generators and tests use this; the solver has its own code for devices (`jaxba.model.camera`). Large
-problems are processed in chunks, so that memory beyond the result stays small.
-"""
+problems are processed in chunks, so that memory beyond the result stays small."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """What of a problem is optimised: `hold` and `release` say it.
 
-What is constant comes back bit for bit.
-"""
+What is constant comes back bit for bit."""
 
 from __future__ import annotations
 
@@ -47,8 +46,7 @@ def hold(
         lenses: constant lenses: positions in `problem.lenses`, or of cameras where every camera has its own.
         numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
             camera model such as `k2`.
-        extrinsics: lenses whose place in their rig is constant; of no effect without rigs.
-    """
+        extrinsics: lenses whose place in their rig is constant; of no effect without rigs."""
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
     constants.poses[_images(problem, poses)] = True
     constants.poses[np.ix_(_images(problem, rotations), ROTATION)] = True
@@ -69,8 +67,7 @@ def hold(
 def release(problem: BundleProblem, *, numbers: Iterable[str]) -> BundleProblem:
     """The problem with numbers of all its lenses optimised. Arguments and errors as for `hold`.
 
-    The principal point of a BAL lens is no number of it: read COLMAP models with `refine_principal_point=True`.
-    """
+    The principal point of a BAL lens is no number of it: read COLMAP models with `refine_principal_point=True`."""
     own = every_lens(problem)
     return problem.replace(lenses=replace(own, free=np.asarray(own.free) | number_columns(own, numbers)))
 

@@ -1,8 +1,7 @@
 """Lenses: which cameras share intrinsics, of which camera model they are, and which of their numbers are optimised.
 
 A *lens* is one set of intrinsics, which several cameras (images) can share. In BAL every camera has a lens of its own.
-In a COLMAP model all images of one physical camera share their intrinsics.
-"""
+In a COLMAP model all images of one physical camera share their intrinsics."""
 
 from __future__ import annotations
 

@@ -5,8 +5,7 @@
 In the normal equations residual and Jacobian are weighted by `sqrt(rho'(s))` (iteratively reweighted least squares).
 The second-derivative term of Triggs' correction is left out, so that every block stays positive semi-definite.
 
-Source: Ceres Solver, loss_function.h; Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis".
-"""
+Source: Ceres Solver, loss_function.h; Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis"."""
 
 from __future__ import annotations
 
@@ -55,8 +54,7 @@ class Loss:
     """A robust loss and its scale (pixels).
 
     Instead of a name you can give a function `rho(s)`, elementwise in JAX, with `rho(0) = 0`, derivative 1 at zero and
-    no negative derivative; JAX differentiates it. Define the function once: another function object compiles again.
-    """
+    no negative derivative; JAX differentiates it. Define the function once: another function object compiles again."""
 
     rho: str | Callable[[Array], Array] = "squared"
     """One of `squared`, `huber`, `soft_l1`, `cauchy`, `tukey`, or a function of `s / scale^2`."""

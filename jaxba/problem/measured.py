@@ -1,7 +1,6 @@
 """Priors of a problem from measurements: `with_position_priors`, `with_rotation_priors`, `with_lens_priors`.
 
-A scene is first aligned with measured positions, since its frame and scale are arbitrary.
-"""
+A scene is first aligned with measured positions, since its frame and scale are arbitrary."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ def with_position_priors(
         loss: robust loss of the squared whitened distance; None: squared.
         align: whether the scene is first moved, turned and scaled to the measured positions, robustly, as COLMAP does.
             What they do not determine, such as the rotation about a line, stays as it is, with a `ProblemWarning`.
-            Without it the scene must be in their frame already.
-    """
+            Without it the scene must be in their frame already."""
     at = _images_at(problem, images)
     measured = finite("positions", positions, (len(at), 3))
     if (covariance is None) == (stddev is None):

@@ -1,7 +1,6 @@
 """Options of an iteration: linear solver, refinement, coordinates and loss.
 
-All options are static and hashable: each distinct value compiles a program of its own.
-"""
+All options are static and hashable: each distinct value compiles a program of its own."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """A part of a problem: some of its images, as after each new image of an incremental reconstruction.
 
-Everything keeps its place and its labels, so that the whole can be written with what was found.
-"""
+Everything keeps its place and its labels, so that the whole can be written with what was found."""
 
 from __future__ import annotations
 

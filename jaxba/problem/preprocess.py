@@ -100,8 +100,7 @@ def perturb(
         seed: a seed or a generator; the same seed gives the same numbers.
         rotation_sigma: radians, on each component of the angle-axis vector.
         translation_sigma: scene units, on each component.
-        point_sigma: scene units, on each coordinate.
-    """
+        point_sigma: scene units, on each coordinate."""
     for name, sigma in (("rotation", rotation_sigma), ("translation", translation_sigma), ("point", point_sigma)):
         if not (np.isfinite(sigma) and sigma >= 0):
             raise ProblemError(f"{name}_sigma must not be negative, got {sigma}")

@@ -4,8 +4,7 @@
 
 A function's positional parameters are unknowns, by name: `pose`, `lens` and `point`, and any other name for a block of
 numbers of its own, one for each camera or a few for all. With `_2` after it a name means those of a second camera.
-Keyword-only parameters are data, a row each. The function whitens its residual itself.
-"""
+Keyword-only parameters are data, a row each. The function whitens its residual itself."""
 
 from __future__ import annotations
 

@@ -8,8 +8,7 @@ with the rotation M and the translation m of the camera in the rig: its extrinsi
 (problem/frames.py): a camera is `[pose of its frame, lens, angle-axis of M, m]`. Cameras of a frame share its pose, and
 extrinsics are shared and free or constant as the numbers of a lens are.
 
-Source: COLMAP 3.12 and later, `Rig` and `Frame`.
-"""
+Source: COLMAP 3.12 and later, `Rig` and `Frame`."""
 
 from __future__ import annotations
 
@@ -34,8 +33,7 @@ LARGEST_DISAGREEMENT = 1e-6
 class Rigs(ArrayRecord):
     """The frame of each camera of a problem, and its place in the rig.
 
-    A solve then adds rotations on the manifold, without camera rounds and pattern moves, which part frames.
-    """
+    A solve then adds rotations on the manifold, without camera rounds and pattern moves, which part frames."""
 
     frame: Int[AnyArray, " cameras"]
     """Frame of each camera, int32."""

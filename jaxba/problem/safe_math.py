@@ -2,8 +2,7 @@
 
 The derivative of `sqrt` at zero is infinite, and `jnp.where` does not hide it: reverse differentiation multiplies it by
 the zero of the branch that was not taken, which gives NaN. So the operand is replaced before the operation where its
-value does not matter. Values are those of the plain operations, bit by bit.
-"""
+value does not matter. Values are those of the plain operations, bit by bit."""
 
 from __future__ import annotations
 

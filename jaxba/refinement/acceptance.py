@@ -7,8 +7,7 @@ With the cost f, the candidate x' and the decrease that the linear model predict
 and no focal length changes its sign (`retraction.keep_focal_signs`).
 
 Source of the gain ratio rho: Nielsen 1999, "Damping Parameter in Marquardt's Method"; of embedded point iterations:
-Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment".
-"""
+Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment"."""
 
 from __future__ import annotations
 

@@ -16,8 +16,7 @@ linear solve and allow longer steps. `Refinement` switches on four of them:
    does the start: the direction between the two follows the valley. Source: Hooke and Jeeves 1961, "Direct search
    solution of numerical and statistical problems".
 
-None of these takes another linear solve, so all of them belong to one iteration.
-"""
+None of these takes another linear solve, so all of them belong to one iteration."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Triangulation of points from the rays of their pixels, as an alternative start of embedded point iterations.
 
 The midpoint is the point nearest to all rays of its pixels, in least squares. With camera centres c and unit rays u it
-solves `sum (I - u u^T) X = sum (I - u u^T) c`.
-"""
+solves `sum (I - u u^T) X = sum (I - u u^T) c`."""
 
 from __future__ import annotations
 

@@ -13,8 +13,7 @@ Two cases do not come back by themselves, since the cost does not see them:
   vanishes, or send it through infinity behind its cameras. So neither the step nor the point's own iterations may
   increase its distance more than `MAX_DISTANCE_RATIO` times.
 
-Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment"; Ceres' inner iterations.
-"""
+Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment"; Ceres' inner iterations."""
 
 from __future__ import annotations
 
@@ -109,8 +108,7 @@ def refine_points(
         previous: points before the step. A diverged point is reset to its previous position first: one that is behind
             a camera and was in front of it, or more than `MAX_DISTANCE_RATIO` times as far away.
         min_decrease: stop after an iteration that lowers the total cost by at most this (pixels^2) and by at most
-            `SMALL_DECREASE` of the cost that is left.
-    """
+            `SMALL_DECREASE` of the cost that is left."""
     one_pass = point_passes(layout, frames)
     before, alone = previous or PreviousPoints.unknown(layout, points), points_alone(layout)
 

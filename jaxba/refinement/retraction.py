@@ -6,8 +6,7 @@ Rotations: `R <- exp(w) R`, or addition of angle-axis vectors. Intrinsics: addit
 The distortion parameters k1 and k2 multiply powers of the *normalised* image radius. If f and all depths grow together,
 which hardly changes the image when cameras move forwards or are far away, the distortion in pixels stays the same only
 if k1 grows with f^2 and k2 with f^4. In (f, k1, k2) such a valley of the cost is curved; in f and the distortion per
-pixel, (k1 / f^2, k2 / f^4), it is straight, and a long step stays on its floor. To first order the two agree.
-"""
+pixel, (k1 / f^2, k2 / f^4), it is straight, and a long step stays on its floor. To first order the two agree."""
 
 from __future__ import annotations
 

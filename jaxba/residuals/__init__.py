@@ -2,8 +2,7 @@
 
 Data are whitened by `sigma`, a standard deviation, or by `whitening`, `Sigma^(-1/2)` of a covariance. Lengths are in
 scene units and in the frame that the problem has when the rows are registered, angles in radians, rotations matrices,
-cameras' axes those of COLMAP (`jaxba.problem.row_value.Pose`).
-"""
+cameras' axes those of COLMAP (`jaxba.problem.row_value.Pose`)."""
 
 from jaxba.residuals.geometry import baseline, control_point, distance, gravity, heading, point_to_plane, position
 from jaxba.residuals.images import depth, lens_bounds, lens_default, lens_defaults, rolling_shutter

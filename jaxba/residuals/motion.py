@@ -1,8 +1,7 @@
 """Residuals of motion between images: relative poses, and inertial measurement units (IMU), integrated beforehand.
 
 Source for IMUs: Forster et al. 2017, "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", with the
-midpoint rule instead of Euler's, measurements interpolated between samples, and derivatives by JAX.
-"""
+midpoint rule instead of Euler's, measurements interpolated between samples, and derivatives by JAX."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ def preintegrated(
         moments: of the images, ascending, within `times`, shape (m + 1,), seconds.
         noise: as in Kalibr's files, shape (4,): densities of white noise of the gyroscope (rad/s/sqrt(Hz)) and of the
             accelerometer (m/s^2/sqrt(Hz)), and of the random walks of their biases (the same per second).
-        bias: of the gyroscope and the accelerometer, about which the result is linear, shape (6,).
-    """
+        bias: of the gyroscope and the accelerometer, about which the result is linear, shape (6,)."""
     t, at = finite("times", times, (np.size(times),)), finite("moments", moments, (np.size(moments),))
     bias, deviation = finite("bias", bias, (6,)), np.repeat(finite("noise", noise, (4,)), 3)
     measured = {"angular_rates": angular_rates, "accelerations": accelerations}

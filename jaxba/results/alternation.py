@@ -1,7 +1,6 @@
 """Bundle adjustment and retriangulation in alternation, until retriangulation no longer lowers the cost.
 
-Source: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited", section 4.4).
-"""
+Source: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited", section 4.4)."""
 
 from __future__ import annotations
 
@@ -50,8 +49,7 @@ def solve_and_retriangulate(
         on_search: called after every retriangulation, including the last one, whose result is discarded if the decrease
             is too small (`Retriangulation.pays`).
         watch: as for `solve`; iterations and seconds are counted over all solves.
-        verbose: as for `solve`.
-    """
+        verbose: as for `solve`."""
     options = checked_options(options)
     callback, compiling = shown(callback, verbose)
     away = set_aside(problem)

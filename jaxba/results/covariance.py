@@ -10,8 +10,7 @@ Directions that nothing determines are left out of both inverses. A number has a
 It is that of the parameters if residuals are independent with unit variance: whitened, or pixels with a noise of one
 pixel (else multiply by the variance). Robust losses weigh it as they weigh the cost.
 
-Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 9; COLMAP, `EstimateBACovariance`.
-"""
+Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 9; COLMAP, `EstimateBACovariance`."""
 
 from __future__ import annotations
 
@@ -100,8 +99,7 @@ class Covariance(ArrayRecord):
     def relative_pose(self, first: int, second: int) -> Float[np.ndarray, "6 6"]:
         """Covariance of a camera's pose in the frame of another, `P_2 = R P_1 + t`: left perturbation of R, and t.
 
-        By first-order propagation through `R = R_2 R_1^T` and `t = t_2 - R t_1`.
-        """
+        By first-order propagation through `R = R_2 R_1^T` and `t = t_2 - R t_1`."""
         relative = self.rotations[second] @ self.rotations[first].T
         moved = relative @ self.translations[first]
         jacobian = np.zeros((6, 12))

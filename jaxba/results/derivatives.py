@@ -11,8 +11,7 @@ by the linear solver of the solve itself. Nothing is differentiated through iter
 of minima (problem/freedoms.py), H is singular along it: y moves orthogonally to the orbit, by the pseudo-inverse.
 
 Source: Griewank and Walther 2008, "Evaluating Derivatives", chapter 15; Blondel et al. 2022, "Efficient and Modular
-Implicit Differentiation".
-"""
+Implicit Differentiation"."""
 
 from __future__ import annotations
 

@@ -10,8 +10,7 @@ shares most points with it, alone, with the points constant.
 
 Source: Black, Rangarajan 1996, "On the unification of line processes, outlier rejection, and robust statistics"
 (weights in the place of a loss); Yang, Antonante, Tzoumas, Carlone 2020, "Graduated non-convexity for robust spatial
-perception"; Zach 2014, "Robust bundle adjustment revisited" (the same weights in bundle adjustment).
-"""
+perception"; Zach 2014, "Robust bundle adjustment revisited" (the same weights in bundle adjustment)."""
 
 from __future__ import annotations
 
@@ -87,8 +86,7 @@ def solve_graduated(
             `sqrt(1 - 3/(2n))` of it.
         callback: as for `solve`; iterations and seconds are counted over all solves.
         watch: as for `solve`; iterations and seconds are counted over all solves.
-        verbose: as for `solve`.
-    """
+        verbose: as for `solve`."""
     check_problem(problem)
     options = checked_options(options)
     if not problem.num_observations:

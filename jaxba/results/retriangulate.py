@@ -6,8 +6,7 @@ meet. With the cameras fixed every point is a problem of three unknowns, which i
 without a linear solve of the whole problem. Bundle adjustment then continues (results/alternation.py).
 
 Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
-section 4.4).
-"""
+section 4.4)."""
 
 from __future__ import annotations
 

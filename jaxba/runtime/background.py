@@ -2,8 +2,7 @@
 
 A call that ran quickly compiled programs for long leaves the fully optimised ones to such a process. It has the lowest
 priority and one core, one at a time works for a folder of programs, and the system ends it after `LIMIT_S` seconds of
-processor time. It gets what to compile through a pipe; nothing that lies on disk is unpickled.
-"""
+processor time. It gets what to compile through a pipe; nothing that lies on disk is unpickled."""
 
 from __future__ import annotations
 

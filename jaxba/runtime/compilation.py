@@ -6,8 +6,7 @@ emitters, whose kernels LLVM takes longest for, computes the same to rounding, b
 as many iterations as would have paid for them from the start: as with skis that may be rented or bought, that costs at
 most about twice the better choice. Where programs are kept on disk, better ones that are there are taken from the
 start, and those that are missing are compiled after the solve, by another process (runtime/background.py). The parts of
-a step are programs of their own, since they gain differently, and are compiled in parallel.
-"""
+a step are programs of their own, since they gain differently, and are compiled in parallel."""
 
 from __future__ import annotations
 

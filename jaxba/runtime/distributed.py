@@ -1,8 +1,7 @@
 """Several processes and several devices: JAX's own runtime, which has to be started before anything is computed.
 
 All processes run the same program on the same arguments. Where only the first may act, since it reads or writes files,
-`together` hands what it found to the others.
-"""
+`together` hands what it found to the others."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 On some Intel processors XLA notes preferences of its compiler (`+prefer-no-gather`) as instructions that a program
 needs, then misses them in the machine, says so for every program that it reads, and may compile them all anew
 (jax-ml/jax#38445). With `--xla_cpu_max_isa=AVX2` it does not. As an option of a single program that changes nothing
-(jaxlib 0.10.2), so it is a flag of the process, which a command may set for itself and a library may not.
-"""
+(jaxlib 0.10.2), so it is a flag of the process, which a command may set for itself and a library may not."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ JAX's own compilation cache needs a program's text, which takes tracing and lowe
 compilation where every program is cached. Here the key is what the text follows from: the function, the types of its
 arguments, its static arguments, this package's source, and JAX; `distrust.programs_folder` has a folder for each kind
 of processor and jaxlib. A file has one line of JSON with the types of the results, and the executable as XLA writes and
-reads it; nothing else in it is ever run.
-"""
+reads it; nothing else in it is ever run."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Control over what XLA fuses: barriers that it does not fuse across, and several results in one loop.
 
 XLA fuses the expression that makes a value into every expression that reads it, and computes it again in each. That is
-right for cheap values. The functions here are for the others: they never change a result by more than rounding.
-"""
+right for cheap values. The functions here are for the others: they never change a result by more than rounding."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 From jaxlib 0.10.2 on XLA gives products and sums of a program on a CPU to YNNPACK, and some of them come back wrong
 without a word: `vmap(lambda x: jnp.sum((M @ x) ** 2))` from 16,385 rows on, in jaxlib 0.10.2 (jax-ml/jax#39103); others
-crash (#39257). `tests/runtime/test_jit.py` shows on which versions this still is so.
-"""
+crash (#39257). `tests/runtime/test_jit.py` shows on which versions this still is so."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ XLA on a CPU compiles a loop that it takes for a small one to a single function,
 fast kernels (the pass `SmallWhileLoopHoistingPass`). That is good for a few scalars; a pass over all observations takes
 three times as long. From jaxlib 0.12 on it takes loops of any size for small ones. It leaves a loop alone that contains
 a sort, which such a function cannot do. So the loops here, with the arguments of those of `jax.lax`, sort two integers
-in every iteration, which takes less than a microsecond. A loop of `jax.lax` that contains one of these is safe, too.
-"""
+in every iteration, which takes less than a microsecond. A loop of `jax.lax` that contains one of these is safe, too."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Memory, threads and memory mappings of the process, set so that XLA on a CPU is fast and does not run out of them.
 
-The commands use all of these; a library user may.
-"""
+The commands use all of these; a library user may."""
 
 from __future__ import annotations
 

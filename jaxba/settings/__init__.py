@@ -1,7 +1,6 @@
 """Strict conversion between nested frozen dataclasses and plain data, as a YAML file holds it.
 
-Unknown keys and values of a wrong type or that the class refuses raise an error of one line with the key's path.
-"""
+Unknown keys and values of a wrong type or that the class refuses raise an error of one line with the key's path."""
 
 from __future__ import annotations
 

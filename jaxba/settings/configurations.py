@@ -2,8 +2,7 @@
 
 An installed jaxba carries copies of them, which setup.py puts there; in a clone they lie beside the package. A file may
 begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states differences to
-its base: mappings are merged key by key, everything else, lists too, replaces what the base says.
-"""
+its base: mappings are merged key by key, everything else, lists too, replaces what the base says."""
 
 from __future__ import annotations
 

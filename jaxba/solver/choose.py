@@ -1,8 +1,7 @@
 """Choice of the linear solver, and refusal of what a method does not support or a machine cannot hold.
 
 The predicted time of an iteration is a sum of amounts of work (observations, pairs, cubes of unknowns, ...) times
-measured seconds per unit. Only ratios matter for the choice, and they differ little between machines.
-"""
+measured seconds per unit. Only ratios matter for the choice, and they differ little between machines."""
 
 from __future__ import annotations
 

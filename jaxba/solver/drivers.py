@@ -1,7 +1,6 @@
 """Who runs the iterations of a solve, and what they show of each: one compiled program, on one device or several.
 
-The third way, from Python, is stepwise.py.
-"""
+The third way, from Python, is stepwise.py."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """One iteration of a solve: an LM step, the policy's next lambda, the stopping rules.
 
 `solve` repeats it as one program (loop.py), from Python (stepwise.py) or on several devices (sharded.py); the game
-repeats it for many scenes at once.
-"""
+repeats it for many scenes at once."""
 
 from __future__ import annotations
 

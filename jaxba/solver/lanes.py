@@ -3,8 +3,7 @@
 On a GPU so many at a time are *lanes*: when a problem ends, its lane takes the next one at once, so that none waits for
 the slowest (`refill`, which the game's `rollout` uses, too). On a CPU the program solves one after the other, and every
 core runs its own (many.py): that has no waiting at all, and arrays stay in the core's cache. Eight lanes side by side
-took three times as long per problem there.
-"""
+took three times as long per problem there."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ def solve_rows(
         used: number of problems.
         options: of the steps, static.
         length: length of the histories, static.
-        lanes: problems at a time, static.
-    """
+        lanes: problems at a time, static."""
 
     def start(one: Starts) -> Carry:
         state = state_of(*one, options, one.cameras.dtype)
@@ -133,8 +131,7 @@ def refill(
         advance: from row and state the next state, a record, and whether the row ends.
         note: what was found, after all lanes have advanced: from what was found before, and rows, states, records and
             ends of lanes. Rows of idle lanes are out of range.
-        found: what was found at first.
-    """
+        found: what was found at first."""
 
     def body(loop: tuple[Any, ...]) -> tuple[Any, ...]:
         row, lane, following, found = loop

@@ -43,8 +43,7 @@ def solve_loop(
         tolerances: convergence tests.
         options: static options of the step.
         max_iterations: length of the record, static.
-        limit: a lower limit of iterations, not static.
-    """
+        limit: a lower limit of iterations, not static."""
     check_x64(state.cost.dtype)
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
     carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)

@@ -2,8 +2,7 @@
 
 Problems are padded to cells (structure/cells.py), chosen from the first ones that come. A bank holds problems of one
 cell and is solved by one call of a program (lanes.py), in a thread: as many threads as there are cores, or GPUs. What
-fits no cell, and what would not pay for compiling, is solved by `solve`.
-"""
+fits no cell, and what would not pay for compiling, is solved by `solve`."""
 
 from __future__ import annotations
 
@@ -73,8 +72,7 @@ def solve_many(
         options: as for `solve`; they hold for all.
 
     Raises:
-        ValueError: bad options, or several processes, before the first result.
-    """
+        ValueError: bad options, or several processes, before the first result."""
     if jax.distributed.is_initialized():
         raise ValueError("solve_many is for one process: start others without connecting them, and divide the problems")
     options = checked_options(options)

@@ -1,8 +1,7 @@
 """Solver names, the same in all commands, tables and files: `[method+]policy[+refineK|+embedded][@dtype]`.
 
 Another library as a solver (a peer) is named `pyceres:MODE`, or `pyceres:MODE+policy[+refineK|+embedded]` if a damping
-policy of jaxba chooses its lambda.
-"""
+policy of jaxba chooses its lambda."""
 
 from __future__ import annotations
 

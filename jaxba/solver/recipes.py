@@ -1,8 +1,7 @@
 """Recipes: policies that often end in different minima. Side by side, the lowest end wins.
 
 Which ones, and in which order, is measured on windows of real problems (`python -m benchmarks.recipes`): each is the
-one that adds most to those before it.
-"""
+one that adds most to those before it."""
 
 from __future__ import annotations
 

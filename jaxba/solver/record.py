@@ -1,8 +1,7 @@
 """The record of a solve: what `jaxba-solve --log` writes, and a line of `results.jsonl`.
 
 `io/json_lines.py` writes it. The keys are the field names below, except that `TracePoint.damping` is written as
-`"lambda"`, a reserved word in Python. They must not change, since other tools and old result files rely on them.
-"""
+`"lambda"`, a reserved word in Python. They must not change, since other tools and old result files rely on them."""
 
 from __future__ import annotations
 

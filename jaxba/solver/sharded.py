@@ -6,8 +6,7 @@ summed over devices, too (structure/devices.py).
 
 Points are dealt to the shards by descending track length, so that each has nearly the same number of points of every
 length, and of observations. Sizes of arrays and lists of blocks must be the same in all shards; they follow from data,
-so that layouts are built again with what was found (`Agreement`), until nothing changes.
-"""
+so that layouts are built again with what was found (`Agreement`), until nothing changes."""
 
 from __future__ import annotations
 

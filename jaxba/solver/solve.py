@@ -195,8 +195,7 @@ def solve(
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
             the method does not support what the problem has (shared lenses, priors, rigs).
         RuntimeError: this process was forked from one in which JAX had started.
-        TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`.
-    """
+        TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`."""
     callback, compiling = shown(callback, verbose)
     hooks = {"callback": callback, "compiling": compiling}
     check_problem(problem)

@@ -3,8 +3,7 @@
 The iteration is that of iteration.py. It consists of three programs (linear solve, accept decision, policy), which are
 compiled in parallel, each with its own level of optimisation, and replaced by better ones when that pays
 (runtime/compilation.py). In one program the candidates of a step are turns of a loop (refinement/candidates.py). Here
-Python is that loop, so that camera rounds are compiled only if a solve has some. What is computed is the same.
-"""
+Python is that loop, so that camera rounds are compiled only if a solve has some. What is computed is the same."""
 
 from __future__ import annotations
 

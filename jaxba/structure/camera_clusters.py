@@ -2,8 +2,7 @@
 
 Agglomerative clustering: pairs of clusters with many common points for their size are merged, many pairs at a time,
 until few enough clusters are left. The coarse system is formed like the reduced camera system, with clusters in place
-of cameras: a *coarse slot* stands for all observations of one point by one cluster.
-"""
+of cameras: a *coarse slot* stands for all observations of one point by one cluster."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Orderings of the cameras that make the reduced camera system a band matrix.
 
 In an image sequence every point is seen for a few frames only. In the right order of the cameras the reduced camera
-system is then a narrow band of width b, and so is its Cholesky factor: `n b^2` operations instead of `n^3 / 3`.
-"""
+system is then a narrow band of width b, and so is its Cholesky factor: `n b^2` operations instead of `n^3 / 3`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Cells: the capacities to which many problems of different sizes are padded, so that they share few programs.
 
 They are chosen from the sizes of problems that were seen, as few or as many as make the predicted time of compiling and
-solving the shortest.
-"""
+solving the shortest."""
 
 from __future__ import annotations
 

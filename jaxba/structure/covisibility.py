@@ -2,8 +2,7 @@
 
 A pair of observations of one point by cameras j and k adds a product to block (j, k). Observations are referred to by
 their camera-sorted index (structure/layout.py): a block then reads two short ranges of memory, while its slots are
-scattered.
-"""
+scattered."""
 
 from __future__ import annotations
 

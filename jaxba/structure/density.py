@@ -1,8 +1,7 @@
 """When the reduced camera system is formed by one dense matrix product instead of from pairs of observations.
 
 Two cases: nearly every camera sees nearly every point, or there are few points (calibration boards, hand-set markers),
-where Woodbury's identity replaces the system by one of the size of the points (linear/woodbury.py).
-"""
+where Woodbury's identity replaces the system by one of the size of the points (linear/woodbury.py)."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 Points are divided among devices, each with its observations and a `Layout` of its own; cameras are on all of them. Sums
 over observations or points, into cameras or scalars, end in one of these functions. Without a mesh they do nothing.
 
-Source: the same division as in PBA (Wu et al. 2011) and DeepLM (Huang et al. 2021); `jax.shard_map`.
-"""
+Source: the same division as in PBA (Wu et al. 2011) and DeepLM (Huang et al. 2021); `jax.shard_map`."""
 
 from __future__ import annotations
 

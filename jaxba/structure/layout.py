@@ -17,8 +17,7 @@ The state, the camera model and all arrays over observations are components-firs
 `[3, points]`, so that every component is a contiguous vector. Linear algebra and a `BundleProblem` are items-first:
 steps, gradients and right-hand sides of the reduced camera system are `[cameras, 9]`, its blocks `[cameras, 9, 9]`.
 
-Everything is computed once per problem, on the host, with vectorised NumPy.
-"""
+Everything is computed once per problem, on the host, with vectorised NumPy."""
 
 from __future__ import annotations
 
@@ -129,8 +128,7 @@ def build_layout(
         observations: the sorted observations of the problem, if they are known already.
         grid: whether a factored system may be formed as one dense matrix product instead of from pairs, where that is
             cheaper (structure/density.py).
-        agreement: with the layouts of the other shards of a problem (solver/sharded.py).
-    """
+        agreement: with the layouts of the other shards of a problem (solver/sharded.py)."""
     factor, pairs = options.factors_reduced_system, options.forms_reduced_system
     if capacity is not None and not factor:
         raise ValueError("only layouts for a factored system are padded")

@@ -7,8 +7,7 @@ inside a cluster this time.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", section 3.3, and
 the authors' code. Here all nodes of a pass choose before any of them moves, so that choosing takes a few array
-operations; in the original each node sees the moves before its own.
-"""
+operations; in the original each node sees the moves before its own."""
 
 from __future__ import annotations
 

@@ -9,8 +9,7 @@ zeros to sums, and its cameras and points never change.
 A tenth to a quarter of the slots are padding: up to a ninth from rounding, the others in half-filled chunks of slots.
 Larger problems are not padded (`capacity_of`), since their iterations take as long as compiling does. A problem with
 few points may lose more than others: with padding it may have too many of them for Woodbury's identity
-(structure/density.py).
-"""
+(structure/density.py)."""
 
 from __future__ import annotations
 

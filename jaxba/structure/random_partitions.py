@@ -4,8 +4,7 @@ A fixed number of partitions is drawn once per problem, with their index arrays,
 that number. Random clusters then cost nothing during the iterations, and the solve is one compiled program.
 
 A point that is seen from several clusters is a *shared point*. STBA splits it into *point replicas*, one per cluster,
-each with the observations of that cluster.
-"""
+each with the observations of that cluster."""
 
 from __future__ import annotations
 

@@ -10,8 +10,7 @@ and its first-order changes by the two cameras,
     min_v  |sqrt(2) (r/2 + a + v)|^2 + |sqrt(2) (r/2 + b - v)|^2  =  |r + a + b|^2
 
 so that eliminating v like any point gives the block of the two cameras. Damping also holds v, by the share lambda.
-A row of two points is split in the same way by numbers of the pose of a new camera.
-"""
+A row of two points is split in the same way by numbers of the pose of a new camera."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Gathers and segmented sums with the index arrays of a `Layout`: sums over the slots of each point or camera.
 
-Some functions exist in two forms only because XLA compiles them differently; their docstrings say which is faster.
-"""
+Some functions exist in two forms only because XLA compiles them differently; their docstrings say which is faster."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Summation trees: index arrays that sum rows into targets by a few gathers and dense sums, without scatter.
 
 Level by level, rows of one target are summed in chunks of fixed width; the partial sums are the rows of the next level.
-The sums themselves are computed by `segment_sums.tree_sum`.
-"""
+The sums themselves are computed by `segment_sums.tree_sum`."""
 
 from __future__ import annotations
 
@@ -53,8 +52,7 @@ def sum_tree(
         width: chunk width on the first level.
         room: bounds from which the shapes follow, together with the number of targets and the width; None: the shapes
             follow from the data.
-        agreement: with the trees of other shards, which have the same shapes.
-    """
+        agreement: with the trees of other shards, which have the same shapes."""
     levels = []
     room = room or Room.of(counts)
     space, most, _ = room
@@ -101,8 +99,7 @@ def prefix_levels(
         empty: index of a row of zeros, for padding.
         room: bounds from which the shapes follow, together with the number of targets.
         first: first rank that is listed. Rank 0 is listed for all targets.
-        loosest: whether it is the last one in any case.
-    """
+        loosest: whether it is the last one in any case."""
     if len(items) > room.items or counts.max(initial=0) > room.most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
     ranks = [first]

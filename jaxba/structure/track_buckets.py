@@ -1,8 +1,7 @@
 """Assignment of observations to slots: buckets of points by track length, or chunks of a fixed capacity.
 
 The track length of a point is its number of observations. Slots of a bucket are arranged in tiles
-(structure/layout.py).
-"""
+(structure/layout.py)."""
 
 from __future__ import annotations
 

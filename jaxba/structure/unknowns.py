@@ -12,8 +12,7 @@ T leaves points alone, so they are eliminated as usual. A factorisation has the 
 camera system S (linear/border.py). Conjugate gradients work on S itself, between projections on the range of T: with
 the orthogonal projector P, which averages over the cameras of a lens,
 
-    P S P d = P b    has the solution    d = T y.
-"""
+    P S P d = P b    has the solution    d = T y."""
 
 from __future__ import annotations
 

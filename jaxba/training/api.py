@@ -62,8 +62,7 @@ def make_env(
     Raises:
         SettingsError: no such preset, or an impossible setting.
         InputError: no scene would be left to train on, or the problems are no source of windows.
-        ValueError: the reward is no such function.
-    """
+        ValueError: the reward is no such function."""
     config = load(preset, overrides)
     if problems:
         names = [f"problem {k}" if isinstance(x, BundleProblem) else str(x) for k, x in enumerate(problems)]
@@ -98,8 +97,7 @@ def train(
 
     Raises:
         ValueError: an impossible number.
-        TrainError: losses or all transitions are not finite, or the folder holds another run.
-    """
+        TrainError: losses or all transitions are not finite, or the folder holds another run."""
     if not isinstance(env, PresetGame):
         raise ValueError(f"env must be a game of jaxba.make_env, not {env!r}")
     if steps < 1:

@@ -1,7 +1,6 @@
 """Checkpoints: a tree of arrays and JSON metadata in one `.npz` file, written atomically.
 
-A tree is a flat mapping from paths to NumPy arrays; restored leaves must have the expected shape and type.
-"""
+A tree is a flat mapping from paths to NumPy arrays; restored leaves must have the expected shape and type."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The configuration of a training run, and the YAML files that hold it.
 
 A file in `configs/train` lists differences to the file that it extends, or to the defaults of the classes
-(jaxba/settings/configurations.py); a run writes all settings into its folder.
-"""
+(jaxba/settings/configurations.py); a run writes all settings into its folder."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `chec
 state, the best policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that
 can be read, removes from the log what was written after it, and repeats that, with the same numbers.
 
-All agents of a run are trained side by side, in one program over an axis of agents.
-"""
+All agents of a run are trained side by side, in one program over an axis of agents."""
 
 from __future__ import annotations
 
@@ -147,8 +146,7 @@ def train(
         loop: of `begin_compiling`; None: it is called now.
 
     Raises:
-        TrainError: losses or all transitions are not finite, or no checkpoint can be used or written.
-    """
+        TrainError: losses or all transitions are not finite, or no checkpoint can be used or written."""
     run = _Run(config, env, evaluate, folder, hooks or Hooks(), loop or begin_compiling(config, env))
     try:
         return run.finish()

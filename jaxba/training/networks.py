@@ -1,8 +1,7 @@
 """Networks of the agent and its distribution over actions. The only module that uses flax.
 
 Parameters are plain trees of float32 arrays, also with 64-bit JAX. Actions are in (-1, 1): `u = tanh(x)` with a normal
-`x`. Log-probabilities are those of `u`, so that the entropy does not depend on the scale of what an action means.
-"""
+`x`. Log-probabilities are those of `u`, so that the entropy does not depend on the scale of what an action means."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Replay buffer: a ring buffer of transitions in one float32 array.
 
 Transitions with a number that is not finite are dropped. Replacing the number by zero would teach the critic a wrong
-value; a game that wants to penalise failures must give a finite reward.
-"""
+value; a game that wants to penalise failures must give a finite reward."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 `twin` is Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications": two critics, target networks of both,
 a learned temperature. `value` is the form of the paper (Belder et al. 2023), that of Haarnoja et al. 2018,
 "Soft Actor-Critic: Off-Policy Maximum Entropy Deep RL": policy, two critics, a value network and its target network, a
-fixed temperature.
-"""
+fixed temperature."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Training as one compiled program: act, step, store, sample and update in one scan.
 
-No data leaves the device within a chunk, which compiles once; the driver evaluates and saves between chunks.
-"""
+No data leaves the device within a chunk, which compiles once; the driver evaluates and saves between chunks."""
 
 from __future__ import annotations
 

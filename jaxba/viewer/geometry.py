@@ -1,7 +1,6 @@
 """Where cameras and residuals are drawn: frusta, residuals as segments.
 
-Frusta have the axes of COLMAP and OpenCV: x to the right, y downwards, z forwards.
-"""
+Frusta have the axes of COLMAP and OpenCV: x to the right, y downwards, z forwards."""
 
 from __future__ import annotations
 

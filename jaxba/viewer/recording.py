@@ -1,8 +1,7 @@
 """Recorded solves: the parameters after every accepted step, and what each iteration came to.
 
 A recording is a NumPy archive (`.npz`) of the arrays of the problem and those of `Recording`. Of a large problem it
-holds an even choice of the points, and the observations of these.
-"""
+holds an even choice of the points, and the observations of these."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 Cameras and points in `problems.csv` are those of the file names of https://grail.cs.washington.edu/projects/bal/ ; the
 download scripts of RootBA and of SymForce list the same 98. The SHA-256 of the compressed files of Ladybug-49 and
-Trafalgar-21 were computed on the files; the others are those of the Julia package VGDatasets. 16 files have none.
-"""
+Trafalgar-21 were computed on the files; the others are those of the Julia package VGDatasets. 16 files have none."""
 
 from __future__ import annotations
 

@@ -5,8 +5,7 @@ Both forms have the same fields in the same order. A file of either has two meth
 `count(field, each)` gives the next value as the number of records of the fields `each` that follow.
 
 Source: COLMAP, doc/format.rst, and src/colmap/scene/
-reconstruction_io_binary.cc and reconstruction_io_text.cc.
-"""
+reconstruction_io_binary.cc and reconstruction_io_text.cc."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """What the files of a COLMAP model hold, with the model's own ids and names, and the checks of its structure.
 
-Source: COLMAP, doc/format.rst and doc/cameras.rst; numbers of models and sensors as in COLMAP 4.2.
-"""
+Source: COLMAP, doc/format.rst and doc/cameras.rst; numbers of models and sensors as in COLMAP 4.2."""
 
 from __future__ import annotations
 

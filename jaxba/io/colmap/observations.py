@@ -1,8 +1,7 @@
 """Which key-point of which image is of which point.
 
 A model says so twice: a key-point names its point, and a point's track its key-points. Key-points are believed, as in
-COLMAP's bundle adjustment: each stands beside its pixel, numbers in tracks go wrong when key-points are sorted.
-"""
+COLMAP's bundle adjustment: each stands beside its pixel, numbers in tracks go wrong when key-points are sorted."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Poses of a COLMAP model.
 
-COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: poses of a problem are BAL's.
-"""
+COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: poses of a problem are BAL's."""
 
 from __future__ import annotations
 

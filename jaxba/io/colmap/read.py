@@ -1,7 +1,6 @@
 """Reads COLMAP models as problems, and says where the parts of a problem stand in its model.
 
-Where the lenses of a problem are BAL's, its pixels are relative to the principal point, which is not optimised.
-"""
+Where the lenses of a problem are BAL's, its pixels are relative to the principal point, which is not optimised."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The text files of a COLMAP model.
 
 Comments, empty lines, byte order marks, Windows line ends and blanks at ends do not matter, and a name is all that
-follows the ninth field of its line. Numbers are written with as many digits as reading them back bit by bit needs.
-"""
+follows the ninth field of its line. Numbers are written with as many digits as reading them back bit by bit needs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """AliceVision's and Meshroom's scenes (`.sfm`, `.json`): views, intrinsics, poses and structure, numbers as texts.
 
 A camera at c maps X to `diag(fx, fy) d((R (X - c)).xy / z) + principal point`, pixels from the corner of the image; R
-is written column by column. Source: AliceVision, sfmDataIO/jsonIO.cpp, and for the versions CHANGES.md beside it.
-"""
+is written column by column. Source: AliceVision, sfmDataIO/jsonIO.cpp, and for the versions CHANGES.md beside it."""
 
 from __future__ import annotations
 

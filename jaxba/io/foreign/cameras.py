@@ -3,8 +3,7 @@
 This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision; the last three also have views with poses
 and intrinsics, and points with observations, in common (`build`). BAL's camera looks down -z with y
 upwards, has no principal point, one focal length, and two coefficients of distortion. Lenses with more of it become
-those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE.
-"""
+those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@
 The camera looks down +z with y downwards; pixels are relative to the principal point. The distortion acts the other way
 round than BAL's: the measured m becomes the undistorted `(1 + r |m|^2 / f^2) m`. `NVM_V3_R9T` has rotation matrices and
 translations. Source: Wu, "VisualSFM: documentation", http://ccwu.me/vsfm/doc.html#nvm; for f^2 and R9T Wu et al.,
-Multicore Bundle Adjustment, `SetNormalizedMeasurementDistortion` and `LoadNVM`.
-"""
+Multicore Bundle Adjustment, `SetNormalizedMeasurementDistortion` and `LoadNVM`."""
 
 from __future__ import annotations
 

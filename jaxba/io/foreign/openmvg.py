@@ -1,8 +1,7 @@
 """OpenMVG's `sfm_data.json`: views, intrinsics, extrinsics and structure, as its serialisation library writes them.
 
 A camera at c maps X to `K d((R (X - c)).xy / z)`, pixels from the corner of the image. A class that comes again has its
-number without the name. Source: OpenMVG, sfm/sfm_data_io_cereal.cpp, cameras/*_io.hpp; cereal, "Polymorphism".
-"""
+number without the name. Source: OpenMVG, sfm/sfm_data_io_cereal.cpp, cameras/*_io.hpp; cereal, "Polymorphism"."""
 
 from __future__ import annotations
 

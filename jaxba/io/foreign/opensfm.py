@@ -2,8 +2,7 @@
 
 Coordinates of images are normalised: the origin is the middle, y grows downwards, the larger side is 1. Focal lengths
 and principal points are in the same unit, so all are multiplied by the larger side. Source: OpenSfM,
-doc/source/dataset.rst and geometry.rst; map/src/tracks_manager.cc for the three versions of tracks.
-"""
+doc/source/dataset.rst and geometry.rst; map/src/tracks_manager.cc for the three versions of tracks."""
 
 from __future__ import annotations
 
