@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import numpy as np
 
 import jaxba
@@ -25,8 +26,12 @@ from benchmarks import peers
 from benchmarks.default_policy import DEGREES, disturbed
 from jaxba.bench.sources import sources
 from jaxba.game.windows import covisible
+from jaxba.lm.step import state_of
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import numerics
+from jaxba.solver.prepare import set_up
 from jaxba.structure.cells import Sizes, work
 
 FILES = (
@@ -37,6 +42,9 @@ FILES = (
 
 CAMERAS, POINTS = (5, 20), (50, 500)
 """Sizes of windows."""
+
+MAPPED = 16
+"""Solves of a batch of plain `vmap`."""
 
 FEWEST = 6
 """Observations of a camera, below which it is left out of a window."""
@@ -108,6 +116,28 @@ def pycolmap_seconds(problems: list[BundleProblem]) -> list[float]:
     return seconds
 
 
+def mapped_rate(problems: list[BundleProblem], policy: str) -> float:
+    """Problems a second of `jax.vmap` over solves padded to the largest, `MAPPED` at a time, compiled before."""
+    sizes = [Sizes.of(one)[:4] for one in problems]
+    capacity = Sizes(*np.max(sizes, axis=0).tolist(), 0).capacity
+    setups = [set_up(one, policy, capacity=capacity) for one in problems]
+    options, tolerances = setups[0].options, jaxba.Tolerances()
+
+    def solved(layout: jaxba.Layout, cameras: jax.Array, points: jax.Array) -> jax.Array:
+        state = state_of(layout, cameras, points, options, np.float64)
+        return jaxba.solve_loop(layout, state, setups[0].policy, tolerances, options, 100)[0].state.cost
+
+    program = jit(jax.vmap(solved))
+    batches = [setups[at : at + MAPPED] for at in range(0, len(setups) - MAPPED + 1, MAPPED)]
+    given = [jax.tree.map(lambda *x: np.stack(x), *[(one.layout, *one.start) for one in batch]) for batch in batches]
+    with numerics(np.float64):
+        jax.block_until_ready(program(*given[0]))
+        began = time.perf_counter()
+        for batch in given:
+            jax.block_until_ready(program(*batch))
+    return MAPPED * len(given) / (time.perf_counter() - began)
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -154,6 +184,7 @@ def main() -> None:
     for problem in few[:100]:
         alone.append(jaxba.solve(problem, args.policy, options))
     print(f"solve, one by one, compilation included: {100 / (time.perf_counter() - began):.1f} a second")
+    print(f"vmap of {MAPPED}, without refilling or compilation: {mapped_rate(few[:64], args.policy):.1f} a second")
     above = np.array([a.final_cost / b.final_cost - 1 for a, b in zip(found, alone, strict=False)])
     print(f"end beside a solve alone: within 1e-6 in {np.mean(abs(above) < 1e-6):.0%}, largest {above.max():.1e}")
     if costs:
