@@ -119,7 +119,7 @@ def pycolmap_seconds(problems: list[BundleProblem]) -> list[float]:
 def mapped_rate(problems: list[BundleProblem], policy: str) -> float:
     """Problems a second of `jax.vmap` over solves padded to the largest, `MAPPED` at a time, compiled before."""
     sizes = [Sizes.of(one)[:4] for one in problems]
-    capacity = Sizes(*np.max(sizes, axis=0).tolist(), 0).capacity
+    capacity = Sizes._make([*np.max(sizes, axis=0).tolist(), 0]).capacity
     setups = [set_up(one, policy, capacity=capacity) for one in problems]
     options, tolerances = setups[0].options, jaxba.Tolerances()
 
