@@ -111,7 +111,15 @@ def in_pairs(problem):
     return problem.replace(rigs=Rigs(frame, rotation, translation))
 
 
-@pytest.mark.parametrize("kind", ["shared lens", "constants", "priors", "rigs"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "shared lens",
+        "constants",
+        pytest.param("priors", marks=pytest.mark.slow),
+        pytest.param("rigs", marks=pytest.mark.slow),
+    ],
+)
 def test_what_a_problem_may_hold_it_may_hold_among_many(small, kind):
     problems, options = general()[kind], replace(QUICK, loss=Loss("huber", 1.0))
     found = list(solve_many(problems, "ceres", options))

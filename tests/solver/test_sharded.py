@@ -81,6 +81,7 @@ def bar(point, point_2, *, length):
     return jnp.linalg.norm(point - point_2) * 20 - length
 
 
+@pytest.mark.slow
 def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
     problem = support.tiny()
     camera, point = problem.camera_index[::5], problem.point_index[::5]
