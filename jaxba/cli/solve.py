@@ -343,6 +343,7 @@ def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
     common.require(not (args.reject and args.retriangulate), "--reject and --retriangulate exclude each other")
+    _check_recipes(args)
     problems = [name for name in (args.problem, *args.more) if name]
     if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
         from jaxba.cli import several
@@ -353,7 +354,6 @@ def _solve(args: Arguments) -> int:
     from jaxba.runtime.distributed import together
 
     path, problem, marks = together(lambda: _checked(args))
-    common.require(marks is None or not args.reject, "--reject is not for a file of control points")
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
@@ -408,6 +408,9 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem, Marks | None]:
         common.check_extra(view.VIEWER)
     with common.notes_printed():
         problem, marks = _constrained(args, path)
+    common.require(marks is None or not args.reject, "--reject is not for a file of control points")
+    known = not args.survey or survey_report.rows_of(problem, marks)
+    common.require(bool(known), "--survey needs control points or distances in the file of --constraints")
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
@@ -463,19 +466,26 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss, marks: int)
     common.print_line(f"wrote {path}")
 
 
+def _check_recipes(args: Arguments) -> None:
+    """Raises UsageError: a wrong number of recipes, or an option that is for one policy."""
+    if args.recipes is None:
+        return
+    from jaxba.solver.recipes import RECIPES
+
+    common.require(2 <= args.recipes <= len(RECIPES), f"--recipes must be 2 to {len(RECIPES)}")
+    others = {f"--{name}": getattr(args, name) for name in ("record", "view", "log", "retriangulate", "reject")}
+    given = [name for name, value in {**others, "--devices and --processes": _is_divided(args)}.items() if value]
+    common.require(not given, f"{', '.join(given)}: for one policy, not for --recipes")
+
+
 def _by_recipes(
     args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions, watch: Watch | None
 ) -> tuple[Solution, list[IterationRecord]]:
     """Solves by several policies, and prints the end of each; the lowest one is the solution."""
     from jaxba.solver.recipes import RECIPES, solve_recipes
 
-    count = args.recipes or 0
-    common.require(2 <= count <= len(RECIPES), f"--recipes must be 2 to {len(RECIPES)}")
-    others = {f"--{name}": getattr(args, name) for name in ("record", "view", "log", "retriangulate", "reject")}
-    given = [name for name, value in {**others, "--devices and --processes": _is_divided(args)}.items() if value]
-    common.require(not given, f"{', '.join(given)}: for one policy, not for --recipes")
     with common.notes_printed():
-        found = solve_recipes(problem, count, policy, options)
+        found = solve_recipes(problem, args.recipes or 1, policy, options)
     for name, one in zip((args.policy, *RECIPES[1:]), found, strict=False):
         common.print_line(f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}")
     return min(found, key=lambda one: one.final_cost), []

@@ -75,10 +75,8 @@ def with_control_points(
     if sigma <= 0:
         raise ValueError(f"pixels: must be a positive number, not {sigma:g}")
     given = read_control_points(_beside(where, value, "file"))
-    stddev, checks = (
-        values.parse_stddev(value, given.names, "point"),
-        values.parse_items(value.get("check", []), "names"),
-    )
+    stddev = values.parse_stddev(value, given.names, "point")
+    checks = values.parse_items(value.get("check", []), "names")
     if unknown := [name for name in checks if name not in given.names]:
         raise ValueError(f"check: there is no point {unknown[0]}; there are {values.names_of(given.names)}")
     items = [[name] for name in _full_names(problem, given.images)]

@@ -104,8 +104,9 @@ def update(reconstruction: Any, problem: BundleProblem) -> None:
         reconstruction.write_binary(old)
         try:
             write_colmap(problem, new, like=old)
-        except ProblemError:
-            raise ProblemError("the problem is not one of this reconstruction") from None
+        except ProblemError as error:
+            message = str(error).replace(str(new), "the reconstruction").replace(str(old), "this reconstruction")
+            raise ProblemError(message) from None
         found = pycolmap.Reconstruction(new)
     for identity, camera in found.cameras.items():
         reconstruction.camera(identity).params = camera.params

@@ -42,9 +42,7 @@ class Found(NamedTuple):
 
     difference: Float[np.ndarray, "n 3"]  # position less the measured one, scene units
     images: Int[np.ndarray, " n"]  # how many see each
-    pixels: Float[
-        np.ndarray, " n"
-    ]  # RMS distance of the pixels from where the point is seen; NaN where nothing sees it
+    pixels: Float[np.ndarray, " n"]  # RMS residual; NaN where nothing sees it
     whitened: Float[np.ndarray, " n"]  # RMS of x, y and z in standard deviations
 
 

@@ -34,3 +34,7 @@ def test_the_command_writes_the_lowest_end_and_names_all(tmp_path, capsys):
     assert written.initial_cost == pytest.approx(min(ends), rel=1e-5)
     assert run([str(tmp_path / "p.txt"), "--recipes", "2", "--log", str(tmp_path / "l.json")]) == 2
     assert "for one policy, not for --recipes" in capsys.readouterr().err
+    assert run([str(tmp_path / "p.txt"), "--recipes", "9"]) == 2
+    found = capsys.readouterr()
+    assert not found.out
+    assert found.err.startswith("error: --recipes must be 2 to ")
