@@ -40,7 +40,7 @@ def collectives(setup: Setup) -> int:
         limit = np.asarray(10, np.int32)
         carry = setup.shards.begin(setup.policy, limit)
         given = setup.shards.layout, carry, setup.policy, jaxba.Tolerances(), limit
-        lowered = sharded._run.lower(*given, mesh=setup.shards._mesh, options=setup.options, length=0)
+        lowered = sharded._run.lower(*given, **setup.shards.static, length=0)
     return lowered.as_text().count("stablehlo.all_reduce")
 
 

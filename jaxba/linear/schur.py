@@ -36,7 +36,7 @@ from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.rotations import left_jacobian, left_jacobian_inverse
 from jaxba.runtime.fusion import compute_in_one_loop
-from jaxba.structure.devices import max_over_devices, sum_over_devices
+from jaxba.structure.devices import kept, max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
 
@@ -120,7 +120,7 @@ def eliminate_points(
         factor = cholesky3(matrix)
         return [*factor, *factor.forward(gradient), *diagonal]
 
-    entries = compute_in_one_loop(factored, sums, jnp.broadcast_to(damping, sums[0].shape))
+    entries = kept(layout, compute_in_one_loop(factored, sums, jnp.broadcast_to(damping, sums[0].shape)))
     factor, solved, diagonal = Cholesky3(*entries[:6]), entries[6:9], entries[9:]
     at_slot = take(jnp.stack(factor), layout.slot_point)
 
@@ -128,7 +128,7 @@ def eliminate_points(
         return [entry for row in jacobian for entry in Cholesky3(*factor).forward(row)]
 
     rows = compute_in_one_loop(projected, at_slot, linear.point_jacobian)
-    return PointSystem(factor, sums[6:], diagonal, solved, [rows[:3], rows[3:]])
+    return PointSystem(factor, kept(layout, sums[6:]), diagonal, solved, [rows[:3], rows[3:]])
 
 
 def camera_system(

@@ -21,7 +21,7 @@ from jaxba.lm.method import method_of
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import Step
-from jaxba.structure.devices import max_over_devices, sum_over_devices
+from jaxba.structure.devices import kept, max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
@@ -47,7 +47,7 @@ def solve_step(
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
     point_step = solution.points
     if point_step is None:
-        point_step = jnp.stack(back_substitute(system, manifold_step))
+        point_step = kept(layout, jnp.stack(back_substitute(system, manifold_step)))
     rotation = jnp.einsum("cij,cj->ci", system.coordinates[1], manifold_step[:, :3])
     camera_step = jnp.concatenate([rotation, manifold_step[:, 3:]], axis=1)
     slope, damped = _slope_and_damping(system, manifold_step, camera_step, point_step)

@@ -33,7 +33,7 @@ from jaxba.problem.safe_math import safe_divide, safe_sqrt
 from jaxba.refinement.acceptance import Candidate, Step, comparison
 from jaxba.refinement.candidates import best_candidate
 from jaxba.runtime.numerics import check_x64, for_traces
-from jaxba.structure.devices import sum_over_devices
+from jaxba.structure.devices import kept, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray
 
@@ -113,6 +113,8 @@ def propose(
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = only_free(layout, linear, options.intrinsics)
+    jacobians = kept(layout, (linear.camera_jacobian, linear.point_jacobian))
+    linear = linear._replace(camera_jacobian=jacobians[0], point_jacobian=jacobians[1])
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration)
     return Proposal(step, linear.reference, is_weightless(layout, linear, state.cost, options.loss))
 

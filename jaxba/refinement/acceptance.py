@@ -24,7 +24,7 @@ from jaxba.problem.safe_math import safe_divide
 from jaxba.refinement.midpoints import refine_from_starts
 from jaxba.refinement.points import PreviousPoints, refine_points
 from jaxba.refinement.retraction import keep_focal_signs
-from jaxba.structure.devices import sum_over_devices
+from jaxba.structure.devices import kept, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
 
@@ -100,7 +100,7 @@ def comparison(
     """The `Comparison` of a step from current cameras and points, whose cost, costs of slots and depths are known."""
     predicted = step.predicted(jnp.ones_like(cost))
     matters = predicted > NEGLIGIBLE * cost
-    previous = PreviousPoints.of(layout, points, reference)
+    previous = kept(layout, PreviousPoints.of(layout, points, reference))
     terms = previous.costs if options.refinement.points else reference.costs
     return Comparison(
         layout=layout,

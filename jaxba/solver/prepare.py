@@ -27,7 +27,7 @@ from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import Placed, check_problem, placed
-from jaxba.solver.sharded import Shards
+from jaxba.solver.sharded import Shards, num_parts
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters
@@ -132,11 +132,13 @@ def set_up(
     options: SolveOptions | None = None,
     away: Int[np.ndarray, " away"] | None = None,
     capacity: Capacity | None = None,
+    *,
+    in_parts: bool = False,
 ) -> Setup:
     """`prepare` without the initial state. Arguments and errors as there.
 
     `away`: whose views are left out, if that is decided. `capacity`: to which sizes it is padded, if that is decided;
-    the layout then stays on the host."""
+    the layout then stays on the host. `in_parts`: whether a device may compute a large problem part by part."""
     check_problem(problem)
     options = checked_options(options)
     if isinstance(policy, str):
@@ -164,7 +166,8 @@ def set_up(
         if capacity:  # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up
             asked = "explicit"  # to the largest capacity it is never slow
         step = choose_linear_solver(here, step, asked, observations, len(devices))
-        shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
+        parts = num_parts(here, step, len(devices)) if in_parts else 1
+        shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
         grid = not given  # else a shape would depend on more than the capacity
         layout = shards.first if shards else build_layout(here, step, capacity, observations, grid=grid)
         layout = layout if shards or given else jax.device_put(layout)

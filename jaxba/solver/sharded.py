@@ -1,8 +1,9 @@
-"""The solve loop on several devices, as one program.
+"""The solve loop of a divided problem: among devices, and in parts that a device computes one after the other.
 
 Points are divided among the devices of a mesh with their observations; cameras, the state of the policy and all
 decisions are on every device. The step is the same as on one device: what is summed over points or observations is
-summed over devices, too (structure/devices.py).
+summed over devices, too (structure/devices.py). On each of them a large problem is divided once more, into parts of
+which one at a time is linearised, summed and forgotten (runtime/parts.py).
 
 Points are dealt to the shards by descending track length, so that each has nearly the same number of points of every
 length, and of observations. Sizes of arrays and lists of blocks must be the same in all shards; they follow from data,
@@ -30,17 +31,32 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.jit import jit
+from jaxba.runtime.parts import in_turns
 from jaxba.solver.iteration import Carry, begin, iterate, problem_info
 from jaxba.solver.loop import loop_from
 from jaxba.structure.agreement import Agreement, merged, same
-from jaxba.structure.devices import AXIS
+from jaxba.structure.devices import DEVICES, PARTS
 from jaxba.structure.layout import Layout, build_layout
 
-_DIVIDED, _EVERYWHERE = PartitionSpec(AXIS), PartitionSpec()
+_DIVIDED, _EVERYWHERE = PartitionSpec(DEVICES), PartitionSpec()
 _STATE: Any = _EVERYWHERE, _DIVIDED, _EVERYWHERE
 _REST: Any = (_EVERYWHERE,) * 4
 _CARRY = Carry(LMState(*_STATE), *_REST)
 """Where the parts of a carry are: points are divided, all else is on every device."""
+
+_DIFFER: Any = False, True, False
+_ALIKE: Any = (False,) * 4
+_IN_PARTS = Carry(LMState(*_DIFFER), *_ALIKE)
+"""Which of them differ between the parts of a device."""
+
+LARGE = 500_000
+"""Observations of a device from which on it computes in parts."""
+
+PART = 15_000
+"""Observations of a part on a CPU, on which its arrays of floats, 1 kB an observation, stay near the cores."""
+
+PART_OF_CAMERA = 4
+"""Observations of a part for each camera, whose sums every part adds to."""
 
 MAX_ROUNDS = 8  # most times that layouts are built until they agree; three or four suffice
 
@@ -49,61 +65,82 @@ class Shards:
     """A problem divided among devices, and the programs of its loop."""
 
     layout: Layout
-    """Layouts of all shards, of equal shapes, along a leading axis that is divided among the devices."""
+    """Layouts of all shards, of equal shapes, along a leading axis that is divided among the devices, and one of the
+    parts of a device where they differ."""
 
     first: Layout
     """The layout of this process's first shard, on the host."""
+
+    static: dict[str, Any]
+    """Static arguments of the programs."""
 
     order: Int[np.ndarray, " points"]
     """The point of the problem at each position of all shards in layout order; the number of points for padding."""
 
     def __init__(
-        self, problem: BundleProblem, options: StepOptions, devices: Sequence[jax.Device], dtype: np.dtype[Any]
+        self,
+        problem: BundleProblem,
+        options: StepOptions,
+        devices: Sequence[jax.Device],
+        dtype: np.dtype[Any],
+        parts: int = 1,
     ) -> None:
-        """Deals the points, builds the layouts of this process, and places them on its devices. The problem is
-        `in_frames` if it has rigs; the devices are those of all processes. Raises ProblemError: the method of the
-        options works on one device only, or there are too few points."""
+        """Deals the points, builds the layouts of this process, and places them on its devices, each with so many
+        parts. The problem is `in_frames` if it has rigs; the devices are those of all processes. Raises ProblemError:
+        the method of the options works on one device only, or there are too few points."""
         check_plain(options, ProblemError, devices=True)
-        self._options, self._devices = options, devices
-        self._mesh = Mesh(np.array(devices), (AXIS,))
-        tracks = np.bincount(problem.point_index, minlength=problem.num_points)
-        dealt = deal_points(tracks, len(devices), [rows.points for rows in problem.residuals.rows])
+        self._devices, self._parts = devices, parts
+        self._mesh = Mesh(np.array(devices), (DEVICES,))
+        dealt = deal_points(problem, parts * len(devices), [rows.points for rows in problem.residuals.rows])
         if not len(dealt[-1]):
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
-        own = [shard_of(problem, points) for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
-        layouts = sharded_layout(own, options, distributed.gather)
-        self.layout, self.first = self._placed(layouts), layouts[0]
-        here = [points for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
+        here = [points for k, points in enumerate(dealt) if _is_here(devices[k // parts])]
+        layouts = sharded_layout([shard_of(problem, points) for points in here], options, distributed.gather)
+        if parts > 1:
+            axes = (PARTS, DEVICES) if len(devices) > 1 else (PARTS,)
+            layouts = [replace(layout, axes=axes) for layout in layouts]
+        self.first = layouts[0]
         orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
+        columns = list(zip(*map(jax.tree.leaves, layouts), strict=True))
+        differ = [{k for k, one in enumerate(columns) if not all(np.array_equal(one[0], x) for x in one[1:])}]
+        differ = set().union(*distributed.gather(differ))
+        apart = tuple(k in differ for k in range(len(columns)))
+        self.static = {"mesh": self._mesh, "options": options, "differ": apart}
+        placed = [self._placed(list(one), differs) for one, differs in zip(columns, apart, strict=True)]
+        self.layout = jax.tree.unflatten(jax.tree.structure(layouts[0]), placed)
         self.order = distributed.to_host(self._placed(orders)).reshape(-1)
         known = np.append(np.asarray(problem.points, dtype), np.zeros((1, 3), dtype), axis=0)
         self._points = self._placed([np.ascontiguousarray(known[order].T) for order in orders])
         cameras = np.ascontiguousarray(np.asarray(problem.cameras, dtype).T)
         self._cameras = jax.device_put(cameras, NamedSharding(self._mesh, _EVERYWHERE))
 
-    def _placed(self, trees: list[Any]) -> Any:
-        """Pytrees of this process's shards as arrays with a leading axis, each entry on its device."""
+    @property
+    def in_parts(self) -> bool:
+        """Whether a device has several parts."""
+        return self._parts > 1
+
+    def _placed(self, leaves: list[Any], apart: bool = True) -> Array:
+        """Arrays of this process's shards as one with a leading axis, each entry on its device, and one of the parts of
+        a device, if these are apart."""
         here = [device for device in self._devices if _is_here(device)]
-        sharding = NamedSharding(self._mesh, _DIVIDED)
-
-        def placed(*leaves: Any) -> Array:
-            parts = [jax.device_put(np.asarray(leaf)[None], device) for leaf, device in zip(leaves, here, strict=True)]
-            shape = (len(self._devices), *np.shape(leaves[0]))
-            return jax.make_array_from_single_device_arrays(shape, sharding, parts)
-
-        return jax.tree.map(placed, *trees)
+        each = self._parts
+        rows = [leaves[k * each : (k + 1) * each] for k in range(len(here))]
+        rows = [np.stack(row) if apart and each > 1 else np.asarray(row[0]) for row in rows]
+        shape = (len(self._devices), *rows[0].shape)
+        placed = [jax.device_put(row[None], device) for row, device in zip(rows, here, strict=True)]
+        return jax.make_array_from_single_device_arrays(shape, NamedSharding(self._mesh, _DIVIDED), placed)
 
     def begin(self, policy: DampingPolicy, limit: Int[np.ndarray, ""]) -> Carry:
         """The carry before the first iteration."""
         given = self.layout, self._cameras, self._points, policy, limit
-        return _begin(*given, mesh=self._mesh, options=self._options)
+        return _begin(*given, **self.static)
 
     def run(
         self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int = 0
     ) -> tuple[Carry, StepInfo]:
         """The whole loop, with a record of the given length; without a length one iteration."""
         given = self.layout, carry, policy, tolerances, limit
-        return _run(*given, mesh=self._mesh, options=self._options, length=length)
+        return _run(*given, **self.static, length=length)
 
 
 def _is_here(device: jax.Device) -> bool:
@@ -120,25 +157,37 @@ def _own(layout: Layout) -> Layout:
     return jax.tree.map(lambda leaf: leaf[0], layout)
 
 
+def _on_own(function: Callable[..., Any], differ: tuple[bool, ...], layout: Layout, *given: Any, parts: Any) -> Any:
+    """`function` of the layout of this device and more, part by part if it has some. `parts` says which of the
+    arguments and which of the results differ between parts."""
+    if PARTS not in layout.axes:
+        return function(layout, *given)
+    of_layout = jax.tree.unflatten(jax.tree.structure(layout), differ)
+    return in_turns(function, PARTS, (layout, *given), (of_layout, *parts[0]), parts[1])
+
+
 def _divided(carry: Carry, points: Callable[[Array], Array]) -> Carry:
     return carry._replace(state=carry.state._replace(points=points(carry.state.points)))
 
 
-@functools.partial(jit, static_argnames=("mesh", "options"))
+@functools.partial(jit, static_argnames=("mesh", "options", "differ"))
 def _begin(
     layout: Layout,
     cameras: Float[Array, "parameters cameras"],
-    points: Float[Array, "shards 3 points"],
+    points: Float[Array, "devices *parts 3 points"],
     policy: DampingPolicy,
     limit: Int[Array, ""],
     *,
     mesh: Mesh,
     options: StepOptions,
+    differ: tuple[bool, ...],
 ) -> Carry:
     def start(layout: Layout, cameras: Array, points: Array, policy: Any, limit: Array) -> Carry:
-        layout, points = _own(layout), points[0]
-        state = LMState(cameras, points, cost(layout, cameras, points, options.loss))
-        carry = begin(problem_info(layout, state, options, limit), policy, state)
+        def first(layout: Layout, cameras: Array, points: Array) -> Carry:
+            state = LMState(cameras, points, cost(layout, cameras, points, options.loss))
+            return begin(problem_info(layout, state, options, limit), policy, state)
+
+        carry = _on_own(first, differ, _own(layout), cameras, points[0], parts=((False, True), _IN_PARTS))
         return _divided(carry, lambda x: x[None])
 
     places = _DIVIDED, _EVERYWHERE, _DIVIDED, _EVERYWHERE, _EVERYWHERE
@@ -146,7 +195,7 @@ def _begin(
     return on_all(layout, cameras, points, policy, limit)
 
 
-@functools.partial(jit, static_argnames=("mesh", "options", "length"))
+@functools.partial(jit, static_argnames=("mesh", "options", "differ", "length"))
 def _run(
     layout: Layout,
     carry: Carry,
@@ -156,11 +205,16 @@ def _run(
     *,
     mesh: Mesh,
     options: StepOptions,
+    differ: tuple[bool, ...],
     length: int,
 ) -> tuple[Carry, StepInfo]:
     def on_one(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> tuple[Carry, Any]:
-        given = _own(layout), _divided(carry, lambda x: x[0]), policy, tolerances, options
-        carry, found = loop_from(*given, length, limit) if length else iterate(*given, limit)
+        def run(layout: Layout, carry: Carry) -> tuple[Carry, Any]:
+            given = layout, carry, policy, tolerances, options
+            return loop_from(*given, length, limit) if length else iterate(*given, limit)
+
+        parts = (_IN_PARTS,), (_IN_PARTS, False)
+        carry, found = _on_own(run, differ, _own(layout), _divided(carry, lambda x: x[0]), parts=parts)
         return _divided(carry, lambda x: x[None]), found
 
     places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
@@ -168,16 +222,27 @@ def _run(
     return on_all(layout, carry, policy, tolerances, limit)
 
 
+def num_parts(problem: BundleProblem, options: StepOptions, devices: int) -> int:
+    """In how many parts each device computes a problem; one if it is not worth it. Only conjugate gradients that do not
+    form the reduced camera system need nothing of all parts at once."""
+    if options.linear_solver != "implicit" or options.method or jax.default_backend() != "cpu":
+        return 1
+    part = max(PART, PART_OF_CAMERA * problem.num_cameras)
+    return problem.num_observations // (part * devices) if problem.num_observations >= LARGE * devices else 1
+
+
 def deal_points(
-    tracks: Int[np.ndarray, " points"], shards: int, together: Sequence[Sequence[Int[np.ndarray, " _"]]] = ()
+    problem: BundleProblem, shards: int, together: Sequence[Sequence[Int[np.ndarray, " _"]]] = ()
 ) -> list[Int[np.ndarray, " _"]]:
-    """The observed points of each shard, ascending: dealt by track length, forwards and backwards in turns; but
-    together those that a row of a residual has."""
+    """The observed points of each shard, ascending: dealt by track length, in each turn by their cameras, so that a
+    shard has few of them; but together those that a row of a residual has."""
+    tracks = np.bincount(problem.point_index, minlength=problem.num_points)
+    camera = np.bincount(problem.point_index, problem.camera_index, problem.num_points) / np.maximum(tracks, 1)
     order = np.argsort(-tracks, kind="stable")[: np.count_nonzero(tracks)]
-    turn, position = np.divmod(np.arange(len(order)), shards)
-    shard = np.where(turn % 2 == 0, position, shards - 1 - position)
+    turn = np.arange(len(order)) // shards
+    order = order[np.lexsort((camera[order], turn))]
     of_point = np.full(len(tracks), -1)
-    of_point[order] = shard
+    of_point[order] = np.arange(len(order)) - shards * turn
     pairs = [own for own in together if len(own) == 2]
     if pairs:
         from scipy.sparse import coo_array
@@ -203,11 +268,13 @@ def sharded_layout(
     """The layouts of shards of one problem, `in_frames` if it has rigs, of equal shapes. `merge` gives what was found
     in all processes for what was found here."""
     known: dict[str, Any] = {}
-    for _ in range(MAX_ROUNDS):
-        agreements = [Agreement(known) for _ in shards]
+    common: dict[str, Any] = {}
+    for number in range(MAX_ROUNDS):
+        common = {} if number < 2 else common  # the first round knows no totals
+        agreements = [Agreement(known, common) for _ in shards]
         layouts = [build_layout(shard, options, agreement=one) for shard, one in zip(shards, agreements, strict=True)]
-        found = merged(merge([one.found for one in agreements]))
+        found = merged(merge([one.found for one in agreements]), known)
         if same(found, known):
-            return [replace(layout, axes=(AXIS,)) for layout in layouts]
+            return [replace(layout, axes=(DEVICES,)) for layout in layouts]
         known = found
     raise RuntimeError("the layouts of shards do not agree")

@@ -218,7 +218,7 @@ def solve_without(
 ) -> Solution:
     """`solve` where it is known which images face away; None: it is not. Programs compile in `compiling`."""
     options = checked_options(options)
-    setup = set_up(problem, policy, options, away)
+    setup = set_up(problem, policy, options, away, in_parts=True)
     alone = callback is None and watch is None
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
@@ -230,7 +230,7 @@ def solve_without(
         elapsed = lambda: time.perf_counter() - began - watched - (driver.compile_s() - compiled)
         steps, records = None, []
         end = Termination.RUNNING if options.max_iterations else Termination.MAX_ITERATIONS
-        if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise):
+        if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
             steps, end = driver.finish()
         while end == Termination.RUNNING and not isinstance(driver, Compiled):
             step, end = driver.iterate()

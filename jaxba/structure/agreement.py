@@ -13,14 +13,20 @@ class Agreement:
     far as it was found in the round before. `ALONE` is that of the only shard, which needs nothing more."""
 
     def __init__(
-        self, known: dict[str, Any] | None = None, found: dict[str, Any] | None = None, prefix: str = ""
+        self,
+        known: dict[str, Any] | None = None,
+        common: dict[str, Any] | None = None,
+        found: dict[str, Any] | None = None,
+        prefix: str = "",
     ) -> None:
+        """`known` was found in the round before, `common` is what the shards of this round have in common so far."""
         self._known, self._prefix = known, prefix
+        self._common: dict[str, Any] = {} if common is None else common
         self.found: dict[str, Any] = {} if found is None else found
 
     def within(self, name: str) -> Agreement:
         """The same for a part, whose names begin with that of the part."""
-        return Agreement(self._known, self.found, f"{self._prefix}{name}.")
+        return Agreement(self._known, self._common, self.found, f"{self._prefix}{name}.")
 
     def size(self, name: str, own: int) -> int:
         """The largest of a number in all shards."""
@@ -34,9 +40,19 @@ class Agreement:
         """The sorted union of keys, sorted ones, in all shards."""
         return np.union1d(own, self._asked("union " + name, own))
 
-    def total(self, name: str, own: Any) -> Any:
-        """The sum over all shards of an array or a sparse matrix."""
-        return self._asked("total " + name, own)
+    def total(self, name: str, own: Callable[[], Any]) -> Any:
+        """The sum over all shards of an array or a sparse matrix, which depends on nothing else that is asked for."""
+        key = f"{self._prefix}total {name}"
+        return self._known[key] if self._known and key in self._known else self._asked("total " + name, own())
+
+    def once(self, name: str, value: Callable[[], Any]) -> Any:
+        """A value that depends on totals and what else all shards have in common."""
+        if self._known is None:
+            return value()
+        key = self._prefix + name
+        if key not in self._common:
+            self._common[key] = value()
+        return self._common[key]
 
     def _asked(self, name: str, own: Any) -> Any:
         if self._known is None:
@@ -48,17 +64,21 @@ class Agreement:
 ALONE = Agreement()
 
 
-def merged(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """What all shards need."""
-    result = {}
+def merged(found: list[dict[str, Any]], known: dict[str, Any]) -> dict[str, Any]:
+    """What all shards need, with the totals of the rounds before."""
+    result = {key: value for key, value in known.items() if _kind(key) == "total"}
     for key in dict.fromkeys(name for one in found for name in one):
         values = [one[key] for one in found if key in one]
-        kind = key.rpartition(".")[2].partition(" ")[0]
+        kind = _kind(key)
         if kind == "union":
             result[key] = np.unique(np.concatenate(values))
         else:
             result[key] = sum(values[1:], values[0]) if kind == "total" else max(values)
     return result
+
+
+def _kind(key: str) -> str:
+    return key.rpartition(".")[2].partition(" ")[0]
 
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> bool:

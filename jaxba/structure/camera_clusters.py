@@ -7,6 +7,7 @@ of cameras: a *coarse slot* stands for all observations of one point by one clus
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Int
@@ -19,6 +20,9 @@ from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
 from jaxba.structure.track_buckets import Slots
 from jaxba.structure.unknowns import Unknowns
 from jaxba.typing import AnyArray, register_pytree
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 CLUSTER_CAMERAS = 8  # or more, for at most `MAX_CLUSTERS`: as many iterations as with 4, down to half of those with 16
 MAX_CLUSTERS = 128  # at most 1280 coarse unknowns: factoring them costs two or three products with such a system
@@ -44,18 +48,12 @@ def cluster_layout(
 
     Clusters have whole frames. They are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`. The
     other shards of a problem (`agreement`) have the same clusters."""
-    from jaxba.structure.agglomeration import agglomerate, joined, shared_points  # SciPy: its import takes 0.2 s
+    from jaxba.structure.agglomeration import shared_points  # SciPy: its import takes 0.2 s
 
-    camera, point, cameras = observations.camera, observations.point, observations.num_cameras
-    points, frames, lenses = len(observations.tracks), unknowns.poses.distinct, unknowns.lenses
-    frame = np.asarray(unknowns.poses.index)
-    num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
-    shared = agreement.total("shared points", shared_points(frame[camera], point, frames, points)[0])
-    label = agglomerate(shared, frames, num_clusters)[frame]
-    of_lens = np.where(np.isin(lenses.index, lenses.owners), lenses.index, cameras)
-    parts, split = np.unique(label * (cameras + 1) + of_lens, return_inverse=True)
-    if len(parts) <= 2 * MAX_CLUSTERS:
-        label = split
+    camera, point, points = observations.camera, observations.point, len(observations.tracks)
+    frame, frames = np.asarray(unknowns.poses.index), unknowns.poses.distinct
+    shared = agreement.total("shared points", lambda: shared_points(frame[camera], point, frames, points)[0])
+    label, ties = agreement.once("labels", lambda: _labels(shared, unknowns, observations.num_cameras))
     clusters = int(label.max()) + 1
     order = sorted_by(label[camera], clusters)
     order = order[sorted_by(point[order], points)]
@@ -75,8 +73,22 @@ def cluster_layout(
         levels=sum_tree(slots.slot[order], counts, slots.empty, width, agreement=agreement.within("slots")),
         point=slots.point[first_slots],
         pairs=pair_layout(*keyed, factor=True, banded=False, agreement=agreement.within("pairs")),
-        ties=tuple(Sharing.of(joined(label, np.asarray(sharing.index))) for sharing, _ in unknowns.parts),
+        ties=ties,
     )
+
+
+def _labels(
+    shared: csr_matrix, unknowns: Unknowns, cameras: int
+) -> tuple[Int[np.ndarray, " cameras"], tuple[Sharing, ...]]:
+    """The cluster of each camera, and which clusters have unknowns in common."""
+    from jaxba.structure.agglomeration import agglomerate, joined
+
+    lenses, num_clusters = unknowns.lenses, max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
+    label = agglomerate(shared, unknowns.poses.distinct, num_clusters)[np.asarray(unknowns.poses.index)]
+    of_lens = np.where(np.isin(lenses.index, lenses.owners), lenses.index, cameras)
+    parts, split = np.unique(label * (cameras + 1) + of_lens, return_inverse=True)
+    label = split if len(parts) <= 2 * MAX_CLUSTERS else label
+    return label, tuple(Sharing.of(joined(label, np.asarray(sharing.index))) for sharing, _ in unknowns.parts)
 
 
 def cluster_members(

@@ -11,9 +11,11 @@ from typing import TypeVar
 
 from jax import Array, lax
 
+from jaxba.runtime.parts import kept as stored
 from jaxba.structure.layout import Layout
 
-AXIS = "devices"  # name of the axis of the mesh over which points are divided
+DEVICES = "devices"  # name of the axis of the mesh over which points are divided
+PARTS = "parts"  # name of the axis of the parts that a device computes one after the other (runtime/parts.py)
 
 T = TypeVar("T")
 
@@ -23,6 +25,11 @@ def sum_over_devices(layout: Layout, values: T) -> T:
     for axis in layout.axes:
         values = lax.psum(values, axis)
     return values
+
+
+def kept(layout: Layout, values: T) -> T:
+    """The same arrays, stored where a program over parts would compute them again (runtime/parts.py)."""
+    return stored(values) if PARTS in layout.axes else values
 
 
 def max_over_devices(layout: Layout, value: Array) -> Array:

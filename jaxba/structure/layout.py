@@ -138,7 +138,7 @@ def build_layout(
     cameras = observations.num_cameras if capacity is None else capacity.cameras
     camera, tracks, order = observations.camera, observations.tracks, observations.order
     seen = np.bincount(camera, minlength=cameras)
-    is_seen = agreement.total("seen", seen) > 0
+    is_seen = agreement.total("seen", lambda: seen) > 0
 
     slots = bucket_slots(tracks, agreement.within("buckets")) if capacity is None else padded_slots(tracks, capacity)
     slot, empty, count = slots.slot, slots.empty, len(slots.point)

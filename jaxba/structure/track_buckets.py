@@ -52,7 +52,7 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALON
     for number, length in enumerate(lengths):
         members = np.flatnonzero((which == number) & (tracks > 0))
         column[members] = np.arange(len(members))
-        wanted = agreement.size(f"bucket {number}", len(members))
+        wanted = max(1, agreement.size(f"bucket {number}", len(members)))
         wanted += number == 0  # one padding point, so that there always is an empty slot
         tile = TILE if wanted >= TILED_POINTS else wanted
         tiles = -(-wanted // tile)

@@ -28,6 +28,7 @@ from jaxba import (
 from jaxba.lm.termination import Tolerances
 from jaxba.problem import geometry
 from jaxba.problem.options import StepOptions
+from jaxba.solver import sharded
 from jaxba.solver.prepare import set_up
 from jaxba.solver.sharded import _run, deal_points, shard_of, sharded_layout
 
@@ -134,6 +135,26 @@ def test_lenses_constants_and_priors_are_divided_too(linear_solver):
     assert support.same_bits(found.cameras[[0, 1, 5], 6:], np.tile(found.cameras[0, 6:], (3, 1)))
 
 
+@pytest.mark.parametrize(
+    ("policy", "devices"),
+    [("ceres", None), *(pytest.param(*one, marks=pytest.mark.slow) for one in [("guarded", None), ("ceres", DEVICES)])],
+)
+def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(policy, devices, monkeypatch):
+    problem = general() if policy == "guarded" else sequence()
+    options = SolveOptions(linear_solver="implicit", max_iterations=6, devices=devices)
+    whole = solve(problem, policy, options)
+    monkeypatch.setattr(sharded, "LARGE", 1)
+    monkeypatch.setattr(sharded, "PART", problem.num_observations // 7)
+    monkeypatch.setattr(sharded, "PART_OF_CAMERA", 0)
+    setup = set_up(problem, policy, options, in_parts=True)
+    assert setup.shards is not None
+    assert setup.shards.in_parts
+    assert setup.shards.layout.slot_camera.shape[1] > 1  # of each device
+    in_parts = solve(problem, policy, options)
+    np.testing.assert_allclose(in_parts.history.cost, whole.history.cost, rtol=1e-9)
+    np.testing.assert_allclose(geometry.cost(in_parts.problem), geometry.cost(whole.problem), rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_callback_sees_the_same_iterations_and_stops():
     problem, records = sequence(), []
@@ -148,7 +169,7 @@ def test_a_callback_sees_the_same_iterations_and_stops():
 def test_every_observation_is_on_one_device_and_each_has_its_share():
     problem = support.odd()
     tracks = np.bincount(problem.point_index, minlength=problem.num_points)
-    dealt = deal_points(tracks, DEVICES)
+    dealt = deal_points(problem, DEVICES)
     assert sorted(np.concatenate(dealt)) == np.flatnonzero(tracks).tolist()
     shares = [int(tracks[points].sum()) for points in dealt]
     assert max(shares) - min(shares) <= tracks.max()
@@ -181,7 +202,7 @@ def test_an_iteration_has_the_stated_number_of_sums_over_devices(linear_solver, 
     limit = np.asarray(5, np.int32)
     carry = jax.eval_shape(lambda: setup.shards.begin(setup.policy, limit))
     given = setup.shards.layout, carry, setup.policy, Tolerances(), limit
-    text = _run.lower(*given, mesh=setup.shards._mesh, options=setup.options, length=0).as_text()
+    text = _run.lower(*given, **setup.shards.static, length=0).as_text()
     assert text.count("stablehlo.all_reduce") == stated
 
 
