@@ -83,8 +83,10 @@ class _Graph:
         level, divided = max((one.node.level for one in inputs), default=0), [one.divided for one in inputs]
         if name in _CALLS:
             return self.built(params["jaxpr" if "jaxpr" in params else "call_jaxpr"], inputs)
-        if name == "optimization_barrier":  # a result for each input
-            return [Value(Node(equation, [one], one.node.level), 0, one.divided) for one in inputs]
+        if name == "optimization_barrier":  # a result for each input, common ones of common inputs alone
+            common_ones = [one for one in inputs if not one.divided]
+            tied = lambda one: [one, *common_ones]
+            return [Value(Node(equation, tied(one), level), 0, one.divided) for one in inputs]
         collective = _sums(equation, self._axis)
         node = Node(equation, inputs, level + collective, collective=collective)
         apart = [any(divided)] * len(equation.outvars)

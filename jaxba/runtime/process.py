@@ -56,6 +56,12 @@ def keep_memory() -> bool:
     return all(mallopt(parameter, value) == 1 for parameter, value in settings)
 
 
+def return_memory() -> None:
+    """Gives the memory that was freed so far back to the system, where the C library is glibc."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
 def out_of_memory(error: Exception) -> bool:
     """Whether Python, NumPy or XLA, on a CPU or a GPU, could not get memory."""
     return isinstance(error, MemoryError) or (

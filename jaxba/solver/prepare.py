@@ -19,7 +19,7 @@ from jaxba.lm.step import state_of
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside
 from jaxba.problem.options import StepOptions
-from jaxba.runtime import distributed
+from jaxba.runtime import distributed, process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.choose import choose_linear_solver
@@ -168,6 +168,8 @@ def set_up(
         step = choose_linear_solver(here, step, asked, observations, len(devices))
         parts = num_parts(here, step, len(devices)) if in_parts else 1
         shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
+        if parts > 1:
+            process.return_memory()
         grid = not given  # else a shape would depend on more than the capacity
         layout = shards.first if shards else build_layout(here, step, capacity, observations, grid=grid)
         layout = layout if shards or given else jax.device_put(layout)

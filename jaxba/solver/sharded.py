@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +30,7 @@ from jaxba.lm.termination import Tolerances
 from jaxba.model.linearize import cost
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
-from jaxba.runtime import distributed
+from jaxba.runtime import distributed, process
 from jaxba.runtime.jit import jit
 from jaxba.runtime.parts import in_turns
 from jaxba.solver.iteration import Carry, begin, iterate, problem_info
@@ -37,6 +38,7 @@ from jaxba.solver.loop import loop_from
 from jaxba.structure.agreement import Agreement, merged, same
 from jaxba.structure.devices import DEVICES, PARTS
 from jaxba.structure.layout import Layout, build_layout
+from jaxba.structure.sum_trees import sorted_by
 
 _DIVIDED, _EVERYWHERE = PartitionSpec(DEVICES), PartitionSpec()
 _STATE: Any = _EVERYWHERE, _DIVIDED, _EVERYWHERE
@@ -52,10 +54,11 @@ _IN_PARTS = Carry(LMState(*_DIFFER), *_ALIKE)
 LARGE = 500_000
 """Observations of a device from which on it computes in parts."""
 
-PART = 15_000
-"""Observations of a part on a CPU, on which its arrays of floats, 1 kB an observation, stay near the cores."""
+PART = 60_000
+"""Observations of a part on a CPU, whose arrays of floats, 1 kB an observation, stay near the cores. Measured: 15 to 60
+thousand are as fast, 120 thousand take a sixth longer; each has index arrays for all cameras and clusters."""
 
-PART_OF_CAMERA = 4
+PART_OF_CAMERA = 8
 """Observations of a part for each camera, whose sums every part adds to."""
 
 MAX_ROUNDS = 8  # most times that layouts are built until they agree; three or four suffice
@@ -90,12 +93,13 @@ class Shards:
         the method of the options works on one device only, or there are too few points."""
         check_plain(options, ProblemError, devices=True)
         self._devices, self._parts = devices, parts
+        self._once: Callable[..., tuple[Carry, StepInfo]] | None = None  # the program of one iteration
         self._mesh = Mesh(np.array(devices), (DEVICES,))
         dealt = deal_points(problem, parts * len(devices), [rows.points for rows in problem.residuals.rows])
         if not len(dealt[-1]):
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         here = [points for k, points in enumerate(dealt) if _is_here(devices[k // parts])]
-        layouts = sharded_layout([shard_of(problem, points) for points in here], options, distributed.gather)
+        layouts = sharded_layout(shards_of(problem, here), options, distributed.gather)
         if parts > 1:
             axes = (PARTS, DEVICES) if len(devices) > 1 else (PARTS,)
             layouts = [replace(layout, axes=axes) for layout in layouts]
@@ -140,7 +144,13 @@ class Shards:
     ) -> tuple[Carry, StepInfo]:
         """The whole loop, with a record of the given length; without a length one iteration."""
         given = self.layout, carry, policy, tolerances, limit
-        return _run(*given, **self.static, length=length)
+        if length:
+            return _run(*given, **self.static, length=length)
+        if self._once is None:
+            self._once = _run.lower(*given, **self.static, length=0).compile()
+            if self.in_parts:
+                process.return_memory()  # of the compiler
+        return self._once(*given)
 
 
 def _is_here(device: jax.Device) -> bool:
@@ -252,14 +262,23 @@ def deal_points(
         graph = coo_array((np.ones(len(first)), (first, second)), (len(tracks), len(tracks)))
         _, group = connected_components(graph, directed=False)
         of_point = np.where(of_point < 0, -1, of_point[np.unique(group, return_index=True)[1]][group])
-    return [np.flatnonzero(of_point == number) for number in range(shards)]
+    return _groups(of_point, shards)
 
 
-def shard_of(problem: BundleProblem, points: Int[np.ndarray, " kept"]) -> BundleProblem:
-    """The problem with all cameras and these points, ascending, and their observations."""
-    own = np.zeros(problem.num_points, bool)
-    own[points] = True
-    return problem.subset(own[problem.point_index], points=points)
+def _groups(group: Int[np.ndarray, " n"], groups: int) -> list[Int[np.ndarray, " _"]]:
+    """The positions of each group, ascending; those of none have -1."""
+    order = sorted_by(group + 1, groups + 1)
+    return np.split(order, np.cumsum(np.bincount(group + 1, minlength=groups + 1))[:-1])[1:]
+
+
+def shards_of(problem: BundleProblem, dealt: Sequence[Int[np.ndarray, " _"]]) -> list[BundleProblem]:
+    """For each of disjoint sets of points, ascending, the problem with all cameras, and their observations."""
+    number = np.full(problem.num_points, -1, np.int32)
+    for k, points in enumerate(dealt):
+        number[points] = k
+    own = _groups(number[problem.point_index], len(dealt))
+    mask = lambda one: np.isin(np.arange(problem.num_observations), one) if problem.residuals else one
+    return [problem.subset(mask(one), points=points) for one, points in zip(own, dealt, strict=True)]
 
 
 def sharded_layout(
@@ -272,7 +291,9 @@ def sharded_layout(
     for number in range(MAX_ROUNDS):
         common = {} if number < 2 else common  # the first round knows no totals
         agreements = [Agreement(known, common) for _ in shards]
-        layouts = [build_layout(shard, options, agreement=one) for shard, one in zip(shards, agreements, strict=True)]
+        build = lambda shard, one: build_layout(shard, options, agreement=one)
+        with ThreadPoolExecutor(process.threads()) as threads:
+            layouts = list(threads.map(build, shards, agreements))
         found = merged(merge([one.found for one in agreements]), known)
         if same(found, known):
             return [replace(layout, axes=(DEVICES,)) for layout in layouts]

@@ -30,7 +30,7 @@ from jaxba.problem import geometry
 from jaxba.problem.options import StepOptions
 from jaxba.solver import sharded
 from jaxba.solver.prepare import set_up
-from jaxba.solver.sharded import _run, deal_points, shard_of, sharded_layout
+from jaxba.solver.sharded import _run, deal_points, sharded_layout, shards_of
 
 DEVICES = 3
 """Of the tests (conftest.py): a number that divides little."""
@@ -174,8 +174,7 @@ def test_every_observation_is_on_one_device_and_each_has_its_share():
     shares = [int(tracks[points].sum()) for points in dealt]
     assert max(shares) - min(shares) <= tracks.max()
     options = StepOptions(linear_solver="sparse")
-    shards = [shard_of(problem, points) for points in dealt]
-    layouts = sharded_layout(shards, options)
+    layouts = sharded_layout(shards_of(problem, dealt), options)
     shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(layout)] for layout in layouts]
     assert shapes[0] == shapes[1] == shapes[2]
     found = Counter()
