@@ -8,17 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
-from jaxba.io.encoding import read_text
+from jaxba.io.decimals import number_lines, observation_lines
+from jaxba.io.encoding import text_pieces
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
 from jaxba.io.text import Text
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
 from jaxba.typing import LARGEST_COUNT
 
+_BLOCK_ROWS = 1 << 18  # observations, or numbers, that are written at once
 _COUNTS = ("cameras", "points", "observations")
 _OBSERVATION = ("camera index", "point index", "x", "y")
 _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
@@ -30,7 +31,7 @@ def read_bal(path: StrPath) -> BundleProblem:
     Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit. The path
     may be a pipe. Raises ProblemError: the file cannot be read or is no valid problem; one line that names the file
     and, where there is one, the line and the field."""
-    problem = _read(Text(read_text(path), display_name(path)))
+    problem = _read(Text(text_pieces(path), display_name(path)))
     note_origin(path, np.asarray(problem.observations))
     return problem
 
@@ -44,12 +45,14 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
     ProblemError: the problem is not valid, for example not finite, has lenses that are not BAL's, or the file cannot be
     written."""
     valid = bal_only(problem, path)
-    index = (valid.camera_index.tolist(), valid.point_index.tolist(), valid.observations.tolist())
+    columns = [np.asarray(one) for one in (valid.camera_index, valid.point_index, valid.observations)]
     with open_output(path) as file:
         file.write(f"{valid.num_cameras} {valid.num_points} {valid.num_observations}\n".encode())
-        file.writelines(f"{camera} {point} {x} {y}\n".encode() for camera, point, (x, y) in zip(*index, strict=True))
-        for numbers in (valid.cameras, valid.points):
-            file.writelines(f"{number}\n".encode() for number in numbers.ravel().tolist())
+        for start in range(0, valid.num_observations, _BLOCK_ROWS):
+            file.write(observation_lines(*(column[start : start + _BLOCK_ROWS] for column in columns)))
+        for numbers in (np.ravel(valid.cameras), np.ravel(valid.points)):
+            for start in range(0, len(numbers), _BLOCK_ROWS):
+                file.write(number_lines(numbers[start : start + _BLOCK_ROWS]))
 
 
 def bal_only(problem: BundleProblem, path: StrPath) -> BundleProblem:
@@ -67,27 +70,45 @@ def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:
 
 
 def _read(text: Text) -> BundleProblem:
-    values = text.read_numbers(partial(_field, ()))
-    text.need(3)
-    num_cameras, num_points, num_observations = counts = text.integers(range(3), 1, LARGEST_COUNT).tolist()
-    text.field = partial(_field, counts)
-    first = 3 + 4 * np.arange(min(num_observations, (len(values) - 3) // 4))
-    camera_index = text.integers(first, 0, num_cameras - 1)
-    point_index = text.integers(first + 1, 0, num_points - 1)
-    ends = np.cumsum([3, 4 * num_observations, CAMERA_SIZE * num_cameras, POINT_SIZE * num_points]).tolist()
-    text.need(ends[-1])
+    counts: list[int] = []
+    ends = [3]
+    columns = [np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2))]
+    numbers = [np.empty((0, CAMERA_SIZE)), np.empty((0, POINT_SIZE))]
+    for block in text.number_blocks(partial(_field, ())):
+        counts += text.integers(range(block.start, min(block.stop, 3)), 1, LARGEST_COUNT).tolist()
+        if len(counts) < 3:
+            continue
+        text.field = partial(_field, counts)
+        ends = np.cumsum([3, 4 * counts[2], CAMERA_SIZE * counts[0], POINT_SIZE * counts[1]]).tolist()
+        start, stop = (min(max(ends[0], at), ends[1]) - 3 for at in (block.start, block.stop))
+        for column in columns:
+            _make_room(column, -(-stop // 4), counts[2])
+        targets = (*columns[:2], *columns[2].T)
+        for part, target in enumerate(targets):
+            first = start + (part - start) % 4
+            ordinals = range(3 + first, 3 + stop, 4)
+            found = text.integers(ordinals, 0, counts[part] - 1) if part < 2 else text.at(ordinals)
+            target[first // 4 : first // 4 + len(found)] = found
+        del target, targets
+        for array, total, begin, end in zip(numbers, counts, ends[1:], ends[2:], strict=False):
+            start, stop = (min(max(begin, at), end) for at in (block.start, block.stop))
+            _make_room(array, -((begin - stop) // array.shape[1]), total)
+            array.ravel()[start - begin : stop - begin] = text.at(range(start, stop))
+        if block.stop > ends[-1]:
+            break
+    text.need(ends[-1] if len(counts) == 3 else 3)
     text.finish(ends[-1])
-    observations, cameras, points = (values[start:end] for start, end in pairwise(ends))
     try:
-        return BundleProblem.create(
-            cameras.reshape(-1, CAMERA_SIZE),
-            points.reshape(-1, POINT_SIZE),
-            observations.reshape(-1, 4)[:, 2:],
-            camera_index,
-            point_index,
-        )
+        return BundleProblem.create(*numbers, columns[2], *columns[:2])
     except ProblemError as error:
         raise ProblemError(f"{text.name}: {error}") from error
+
+
+def _make_room(array: np.ndarray, rows: int, total: int) -> None:
+    """Makes an array, of which there are no views, as long as so many rows of at most a total need. It doubles: what a
+    header says counts for nothing before the numbers are there."""
+    if rows > len(array):
+        array.resize((min(total, max(rows, 2 * len(array))), *array.shape[1:]), refcheck=False)
 
 
 def _field(counts: Sequence[int], ordinal: int) -> str:

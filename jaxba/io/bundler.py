@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from jaxba.io.bal import bal_only
-from jaxba.io.encoding import read_text
+from jaxba.io.encoding import text_pieces
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
 from jaxba.io.ply import POINT_COLOUR
@@ -32,7 +32,7 @@ def read_bundler(path: StrPath) -> BundleProblem:
     fewer than two cameras see them. Colours and key-point numbers are ignored. The path may be a pipe. Raises
     ProblemError: the file cannot be read or is no valid model, or a point is seen by an unregistered camera; one line
     that names the file and, where there is one, the line and the field."""
-    text = Text(read_text(path), display_name(path))
+    text = Text(text_pieces(path), display_name(path))
     header = text.next_line()
     if header != HEADER:
         shown = ascii(header[:40].decode("latin-1"))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import codecs
 import json
+from collections.abc import Iterator
+from itertools import chain
 from typing import Any
 
-from jaxba.io.files import StrPath, display_name, read_bytes
+from jaxba.io.files import StrPath, display_name, read_pieces
 from jaxba.problem.bundle_problem import ProblemError
 
 MARKS = {
@@ -18,11 +20,18 @@ MARKS = {
 }
 """Byte order marks, and the encodings that they announce. Source: the Unicode standard, section 23.8."""
 
+_LONGEST_MARK = max(map(len, MARKS))
+
 
 def read_text(path: StrPath) -> bytes:
     """`plain_text` of a decompressed file. Raises ProblemError: unreadable, or not in its mark's encoding."""
+    return b"".join(text_pieces(path))
+
+
+def text_pieces(path: StrPath) -> Iterator[bytes]:
+    """The same in pieces."""
     try:
-        return plain_text(read_bytes(path))
+        yield from _plain(read_pieces(path))
     except UnicodeError as error:
         raise ProblemError(
             f"{display_name(path)}: is not the text that its byte order mark announces ({error.args[0]})"
@@ -40,11 +49,23 @@ def read_characters(path: StrPath) -> str:
 def plain_text(data: bytes) -> bytes:
     """The text in all bytes of a file, without a byte order mark, and with lines that end in LF. UTF-16 and UTF-32 with
     their marks become UTF-8, all else stays. Raises UnicodeDecodeError: the text is not in the encoding of its mark."""
-    mark = next((mark for mark in MARKS if data.startswith(mark)), b"")
-    text = data[len(mark) :]
+    return b"".join(_plain(iter([data])))
+
+
+def _plain(pieces: Iterator[bytes]) -> Iterator[bytes]:
+    begin, held = b"", b""
+    while len(begin) < _LONGEST_MARK and (piece := next(pieces, None)) is not None:
+        begin += piece
+    mark = next((mark for mark in MARKS if begin.startswith(mark)), b"")
+    pieces = chain([begin[len(mark) :]], pieces)
     if mark and MARKS[mark] != "utf-8":
-        text = text.decode(MARKS[mark]).encode()
-    return text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+        pieces = (text.encode() for text in codecs.iterdecode(pieces, MARKS[mark]))
+    for piece in pieces:
+        text = held + piece
+        held = b"\r" if text.endswith(b"\r") else b""  # LF may follow
+        text = text[: len(text) - len(held)]
+        yield text.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in text else text
+    yield b"\n" if held else b""
 
 
 def parse_json(text: str | bytes) -> Any:

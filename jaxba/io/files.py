@@ -9,8 +9,10 @@ import os
 import stat
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypeAlias
 
@@ -32,6 +34,7 @@ _DECODERS: dict[str, Callable[[], Any]] = {
     ".gz": lambda: zlib.decompressobj(wbits=31),  # 31: with a header of gzip
     ".xz": lzma.LZMADecompressor,
 }
+_PIECE = 1 << 20  # bytes that are read from a file at once
 _BZIP2_BLOCK = 1 << 20  # bytes; bzip2 gives nothing before the end of its first block of at most 900 kB
 
 
@@ -70,15 +73,21 @@ def read_bytes(path: StrPath, decompress: bool = True) -> bytes:
     """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name. Binary
     files may begin with any number, and are not to be decompressed. Raises ProblemError: it cannot be read, is not
     compressed as its name says, or is damaged; one line."""
+    return b"".join(read_pieces(path, decompress))
+
+
+def read_pieces(path: StrPath, decompress: bool = True) -> Iterator[bytes]:
+    """The same in pieces."""
     name = display_name(path)
     try:
         with open(path, "rb") as file:
-            data = file.read()
-        kind = _compression(data) if decompress else None
-        suffix = os.path.splitext(path)[1].lower()
-        if data and decompress and suffix in _MAGIC and kind is None:
-            raise ProblemError(f"{name}: the file is no {suffix[1:]} file, as its name says")
-        return data if kind is None else _decompressed(data, _DECODERS[kind])
+            begin = file.read(_PIECE)
+            kind = _compression(begin) if decompress else None
+            suffix = os.path.splitext(path)[1].lower()
+            if begin and decompress and suffix in _MAGIC and kind is None:
+                raise ProblemError(f"{name}: the file is no {suffix[1:]} file, as its name says")
+            pieces = chain([begin], iter(partial(file.read, _PIECE), b""))
+            yield from pieces if kind is None else _decompressed(pieces, _DECODERS[kind])
     except ProblemError:
         raise
     except (*READ_ERRORS, ValueError) as error:  # ValueError: a name with NUL or a lone surrogate
@@ -141,16 +150,16 @@ def _compression(data: bytes) -> str | None:
     return next((kind for kind, magic in _MAGIC.items() if data.startswith(magic)), None)
 
 
-def _decompressed(data: bytes, new_decoder: Callable[[], Any]) -> bytes:
+def _decompressed(pieces: Iterable[bytes], new_decoder: Callable[[], Any]) -> Iterator[bytes]:
     """The contents of all streams. The standard library's functions would ignore garbage after the first one."""
-    parts = []
-    while data:
-        decoder = new_decoder()
-        parts.append(decoder.decompress(data))
-        if not decoder.eof:
-            raise EOFError("the compressed data is cut short")
-        data = decoder.unused_data.lstrip(b"\0")  # xz allows zeros between streams
-    return b"".join(parts)
+    decoder = None
+    for data in pieces:
+        while data := data if decoder else data.lstrip(b"\0"):  # xz allows zeros between streams
+            decoder = decoder or new_decoder()
+            yield decoder.decompress(data)
+            data, decoder = (decoder.unused_data, None) if decoder.eof else (b"", decoder)
+    if decoder is not None:
+        raise EOFError("the compressed data is cut short")
 
 
 def _compressor(file: IO[bytes], path: StrPath) -> Any:

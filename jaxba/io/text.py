@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-import warnings
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Int
 
+from jaxba.io.decimals import number, parse
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
 
@@ -19,24 +19,6 @@ SHOWN = 40  # characters of a wrong word that a message shows
 
 _SPACE = re.compile(rb"[ \t\n\r\v\f]")
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
-_NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?", re.IGNORECASE)
-_NOT_FINITE = re.compile(
-    rb"[+-]?(?:nan(?:\(\w*\))?|inf(?:inity)?|\d\.#(?:[qs]nan|ind|inf)\d*)",  # the last is Microsoft's, as 1.#QNAN
-    re.IGNORECASE,
-)
-_FORTRAN = re.compile(rb"[\d.][Dd][+-]?\d")  # the exponent of 1.0D+00
-_FORTRAN_TO_C = bytes.maketrans(b"Dd", b"Ee")
-
-
-def number(word: str) -> float:
-    """The number that a word is, also with Fortran's exponents (1.0D+00); NaN if it is one that is not finite in any
-    spelling (inf, -nan(ind), 1.#QNAN). Raises ValueError: it is no number."""
-    text = word.encode("utf-8", "replace")
-    if _NUMBER.fullmatch(text):
-        return float(text.translate(_FORTRAN_TO_C))
-    if _NOT_FINITE.fullmatch(text):
-        return float("nan")
-    raise ValueError(f"{word!r} is no number")
 
 
 def shown_word(word: bytes) -> str:
@@ -64,14 +46,15 @@ class Text:
 
     Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0."""
 
-    def __init__(self, text: bytes, name: str):
-        """`text` of the file called `name`, with lines that end in LF."""
+    def __init__(self, pieces: Iterable[bytes], name: str):
+        """`pieces` of the text of the file called `name`, with lines that end in LF."""
         self.name = name
         self.line = 0  # number of the line that was read last, from 1
-        self.values = np.empty(0)  # the numbers, up to the first word that is none
+        self.values = np.empty(0)  # the numbers that are kept, up to the first word that is none
         self.field: Callable[[int], str]  # what the number at an ordinal is; may be replaced while reading
-        self._text, self._at = text, 0  # where the next line begins
-        self._blocks: list[tuple[int, int]] = []  # of each block the ordinal of its first number, and where it begins
+        self._pieces, self._text, self._at = iter(pieces), b"", 0  # what follows, and where in it the next line begins
+        self._blocks: list[tuple[int, int, bytes]] = []  # those kept: ordinal of the first number, lines before, text
+        self._start = self._count = 0  # ordinals of the first number that is kept, and of the next one to read
         self._complaint: str | None = None  # about the word after the last number
 
     @property
@@ -82,8 +65,11 @@ class Text:
     def next_line(self) -> bytes:
         """The next line that is not blank, without blanks at its ends; empty at the end of the text."""
         line = b""
-        while not line and self._at < len(self._text):
-            end = self._text.find(b"\n", self._at)
+        while not line:
+            while (end := self._text.find(b"\n", self._at)) < 0 and self._more():
+                pass
+            if self._at >= len(self._text):
+                break
             end = end if end >= 0 else len(self._text)
             line, self._at = self._text[self._at : end].strip(), end + 1
             self.line += 1
@@ -91,33 +77,45 @@ class Text:
 
     def read_numbers(self, field: Callable[[int], str]) -> np.ndarray:
         """Parses all that follows the lines that were read; returns `values`."""
-        self.field, parts, size, start = field, [], 0, self._at
-        while start < len(self._text) and self._complaint is None:
-            space = _SPACE.search(self._text, start + BLOCK_BYTES)
-            end = space.end() if space else len(self._text)
-            values, self._complaint = _parse(self._text[start:end])
-            self._blocks.append((size, start))
-            parts, size, start = [*parts, values], size + len(values), end
-        self.values = np.concatenate([np.empty(0), *parts])
+        parts, blocks = [np.empty(0)], []
+        for _ in self.number_blocks(field):
+            parts.append(self.values)
+            blocks += self._blocks
+        self.values, self._blocks, self._start = np.concatenate(parts), blocks, 0
         return self.values
+
+    def number_blocks(self, field: Callable[[int], str]) -> Iterator[range]:
+        """Parses the same a block at a time. Yields ordinals of its numbers, which until the next one are `values`."""
+        self.field, lines, last = field, self.line, False
+        while not last and self._complaint is None:
+            while not (space := _SPACE.search(self._text, self._at + BLOCK_BYTES)) and self._more():
+                pass
+            last = space is None
+            end = space.end() if space else len(self._text)
+            text, self._at = self._text[self._at : end], end
+            self._blocks, self._start = [(self._count, lines, text)], self._count
+            self.values, self._complaint = parse(text)
+            if self.values.size or self._complaint:
+                self.line = lines + text.rstrip().count(b"\n") + 1  # the last one that is not blank
+            lines += text.count(b"\n")
+            self._count += len(self.values)
+            yield range(self._start, self._count)
 
     def need(self, count: int) -> None:
         """Refuses a text of fewer numbers. Raises ProblemError: it says why there are no more of them."""
-        have = len(self.values)
-        if count > have and self._complaint is not None:
-            self.fail(have, self._complaint)
-        if count > have:
-            line = self._text.rstrip().count(b"\n") + 1
-            raise ProblemError(f"{self.name} line {line}: the file ends before the {self.field(have)}")
+        if count > self._count and self._complaint is not None:
+            self.fail(self._count, self._complaint)
+        if count > self._count:
+            raise ProblemError(f"{self.where}: the file ends before the {self.field(self._count)}")
 
     def finish(self, count: int) -> None:
         """Refuses a text in which a word follows so many numbers. Raises ProblemError."""
-        if count < len(self.values) or self._complaint is not None:
+        if count < self._count or self._complaint is not None:
             self.fail(count, "is left over after the last number", field="")
 
-    def integers(self, ordinals: Sequence[int] | np.ndarray, low: int, high: int) -> np.ndarray:
+    def integers(self, ordinals: range | Sequence[int] | np.ndarray, low: int, high: int) -> np.ndarray:
         """The numbers at some ordinals as int32. Raises ProblemError: one is no integer in `[low, high]`."""
-        values = self.values[ordinals]
+        values = self.at(ordinals)
         whole = values == np.floor(values)
         bad = np.flatnonzero(~(whole & (values >= low) & (values <= high)))
         if bad.size:
@@ -125,17 +123,34 @@ class Text:
             self.fail(int(ordinals[bad[0]]), complaint)
         return values.astype(np.int32)
 
+    def at(self, ordinals: range | Sequence[int] | np.ndarray) -> np.ndarray:
+        """The numbers at some ordinals that are kept."""
+        if isinstance(ordinals, range):
+            return self.values[ordinals.start - self._start : max(ordinals.stop - self._start, 0) : ordinals.step]
+        return self.values[np.asarray(ordinals) - self._start]
+
     def fail(self, ordinal: int, complaint: str, *, field: str | None = None) -> NoReturn:
         """Raises a `ProblemError` about the number (or bad word) at an ordinal."""
-        first, start = self._blocks[bisect_right(self._blocks, ordinal, key=lambda block: block[0]) - 1]
-        for word in _WORD.finditer(self._text, start):
+        first, lines, text = self._blocks[bisect_right(self._blocks, ordinal, key=lambda block: block[0]) - 1]
+        for word in _WORD.finditer(text):
             if first == ordinal:
                 field = self.field(ordinal) if field is None else field
-                line = self._text.count(b"\n", 0, word.start()) + 1
+                line = lines + text.count(b"\n", 0, word.start()) + 1
                 of = f" ({field})" if field else ""
                 raise ProblemError(f"{self.name} line {line}: {shown_word(word[0])} {complaint}{of}")
             first += 1
         raise AssertionError("the text has such a word")
+
+    def _more(self) -> bool:
+        """Takes a block more of the text; False at its end."""
+        parts, size = [self._text[self._at :]], 0
+        for piece in self._pieces:
+            parts.append(piece)
+            size += len(piece)
+            if size >= BLOCK_BYTES:
+                break
+        self._text, self._at = b"".join(parts), 0
+        return size > 0
 
 
 POINT_FIELDS = ("x", "y", "z", "red", "green", "blue", "number of views")
@@ -187,37 +202,3 @@ def numbered(index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     numbers = np.empty(len(index), np.int64)
     numbers[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
     return numbers
-
-
-def _parse(text: bytes) -> tuple[np.ndarray, str | None]:
-    """The numbers of a text up to the first bad word, and what is wrong with that one, if any."""
-    codes = np.frombuffer(text, np.uint8)
-    spaces = (codes == 32) | (codes - np.uint8(9) < 5)  # isspace() of C
-    count = np.count_nonzero(~spaces[1:] & spaces[:-1]) + (not spaces[0])
-    if not count:
-        return np.empty(0), None
-    values = _parse_quickly(text)
-    if values.size != count and _FORTRAN.search(text):
-        values = _parse_quickly(text.translate(_FORTRAN_TO_C))
-    if values.size != count:  # one of the words is no number: search it word by word
-        good = []
-        for word in _WORD.findall(text):
-            try:
-                good.append(number(word.decode("latin-1")))
-            except ValueError:
-                break
-        values = np.array(good, dtype=np.float64)
-    finite = np.isfinite(values)
-    if not finite.all():
-        return values[: finite.argmin()], "is not a finite number"
-    return values, None if values.size == count else "is not a number"
-
-
-def _parse_quickly(text: bytes) -> np.ndarray:
-    """The numbers of a text; of another count than its words if one of them is no number."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # NumPy before 2.3 warns instead of raising ValueError
-            return np.fromstring(text, dtype=np.float64, sep=" ")
-    except (ValueError, DeprecationWarning):
-        return np.empty(0)

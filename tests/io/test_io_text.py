@@ -8,7 +8,7 @@ import support
 
 from jaxba import write_bal
 from jaxba.io import ProblemWarning, read_problem, write_bundler, write_problem
-from jaxba.io.text import number
+from jaxba.io.decimals import number
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.settings import configurations

@@ -15,8 +15,9 @@ import numpy as np
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
 from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model
+from jaxba.io.decimals import number
 from jaxba.io.encoding import read_text
-from jaxba.io.text import number, shown_word
+from jaxba.io.text import shown_word
 from jaxba.problem.bundle_problem import ProblemError
 
 _NAME = len(fields.IMAGE.names)  # fields before the name of an image

@@ -9,9 +9,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxba.io.decimals import number
 from jaxba.io.encoding import parse_json, read_characters
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
 
 LARGEST_INTEGER = 2**53  # whole numbers below it are exact as float64

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.encoding import read_text
+from jaxba.io.encoding import text_pieces
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign.cameras import ForeignLens, assemble
 from jaxba.io.notes import note, note_origin
@@ -38,7 +38,7 @@ def read_nvm(path: StrPath) -> BundleProblem:
     undistorted once and residuals weighted so that to first order they are those of the measured image; its f is
     optimised, k1 and k2 stay zero. With `FixedK` all intrinsics stay as they are. Raises ProblemError: the file cannot
     be read or is no valid model; one line that names the file and, where there is one, the line and the field."""
-    text = Text(read_text(path), display_name(path))
+    text = Text(text_pieces(path), display_name(path))
     matrices, calibration = _header(text)
     images = _images(text, matrices)
     values = text.read_numbers(lambda _: "number of points")

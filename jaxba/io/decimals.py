@@ -1,0 +1,124 @@
+"""Decimal numbers as text: correctly rounded when read, and the shortest that read back the same when written.
+
+Blocks go through SciPy's reader and writer of Matrix Market files, whose bodies are lines of such numbers. They are in
+C++, with threads."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_WORD = re.compile(rb"[^ \t\n\r\v\f]+")
+_NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?", re.IGNORECASE)
+_NOT_FINITE = re.compile(
+    rb"[+-]?(?:nan(?:\(\w*\))?|inf(?:inity)?|\d\.#(?:[qs]nan|ind|inf)\d*)",  # the last is Microsoft's, as 1.#QNAN
+    re.IGNORECASE,
+)
+_FORTRAN = re.compile(rb"[\d.][Dd][+-]?\d")  # the exponent of 1.0D+00
+_FORTRAN_TO_C = bytes.maketrans(b"Dd", b"Ee")
+
+_DIGIT, _POINT, _SIGN, _EXPONENT, _SPACE, _OTHER = (1 << k for k in range(6))  # kinds of characters
+_KINDS = {_DIGIT: b"0123456789", _POINT: b".", _SIGN: b"+-", _EXPONENT: b"eE", _SPACE: b" \t\n\r\v\f"}
+_KIND_OF = bytes(next((kind for kind, these in _KINDS.items() if byte in these), _OTHER) for byte in range(256))
+_TO_LINES = bytes.maketrans(_KINDS[_SPACE], 6 * b"\n")
+_HEADER = b"%%%%MatrixMarket matrix array real general\n%d 1\n"
+_HEADER_LINES = 3  # of what SciPy writes
+
+
+def number(word: str) -> float:
+    """The number that a word is, also with Fortran's exponents (1.0D+00); NaN if it is one that is not finite in any
+    spelling (inf, -nan(ind), 1.#QNAN). Raises ValueError: it is no number."""
+    text = word.encode("utf-8", "replace")
+    if _NUMBER.fullmatch(text):
+        return float(text.translate(_FORTRAN_TO_C))
+    if _NOT_FINITE.fullmatch(text):
+        return float("nan")
+    raise ValueError(f"{word!r} is no number")
+
+
+def parse(text: bytes) -> tuple[Float[np.ndarray, " n"], str | None]:
+    """The numbers of a text up to the first bad word, and what is wrong with that one, if any."""
+    text = text if text[-1:].isspace() else text + b"\n"
+    kinds = np.frombuffer(text.translate(_KIND_OF), np.uint8)
+    spaces = kinds == _SPACE
+    count = int(np.count_nonzero(spaces[1:] > spaces[:-1]))  # the ends of words
+    if not count:
+        return np.empty(0), None
+    values = _parse_lines(text, kinds, count)
+    if values.size != count:
+        values = _parse_words(text.translate(_FORTRAN_TO_C) if _FORTRAN.search(text) else text)
+    if values.size != count:  # one of the words is no number: search it word by word
+        good = []
+        for word in _WORD.findall(text):
+            try:
+                good.append(number(word.decode("latin-1")))
+            except ValueError:
+                break
+        values = np.array(good, dtype=np.float64)
+    finite = np.isfinite(values)
+    if not finite.all():
+        return values[: finite.argmin()], "is not a finite number"
+    return values, None if values.size == count else "is not a number"
+
+
+def observation_lines(
+    camera_index: Int[np.ndarray, " n"], point_index: Int[np.ndarray, " n"], pixels: Float[np.ndarray, "n 2"]
+) -> bytes:
+    """Lines of an index of a camera, one of a point, and x and y; n > 0."""
+    from scipy.sparse import coo_array
+
+    complex_pixels = np.ascontiguousarray(pixels, np.float64).view(np.complex128)[:, 0]
+    entries = coo_array((complex_pixels, (camera_index, point_index)))
+    entries.coords = (camera_index - np.int32(1), point_index - np.int32(1))  # the format counts from 1
+    return _written(entries)
+
+
+def number_lines(values: Float[np.ndarray, " n"]) -> bytes:
+    """Lines of one number each; n > 0."""
+    return _written(np.asarray(values, np.float64)[:, None])
+
+
+def _written(matrix: object) -> bytes:
+    from scipy.io import mmwrite
+
+    file = io.BytesIO()
+    mmwrite(file, matrix, symmetry="general")
+    return file.getvalue().split(b"\n", _HEADER_LINES)[_HEADER_LINES].lower()
+
+
+def _parse_lines(text: bytes, kinds: np.ndarray, count: int) -> np.ndarray:
+    """The numbers of a text of so many words, more than none; empty if one of them is no number or begins with a plus.
+
+    SciPy's reader takes the longest number that a line begins with, and drops the rest and the sign of zero."""
+    from scipy.io import mmread
+
+    before, after = kinds[:-1], kinds[1:]
+    torn = ((after == _SIGN) & (before < _EXPONENT)) | ((after == _SPACE) & (before & (_SIGN | _EXPONENT) != 0))
+    parts = kinds.tobytes().translate(None, bytes([_DIGIT, _SIGN]))
+    wrong = ((_OTHER,), (_POINT, _POINT), (_EXPONENT, _POINT), (_EXPONENT, _EXPONENT))
+    if torn.any() or any(bytes(one) in parts for one in wrong):
+        return np.empty(0)
+    try:
+        values = mmread(io.BytesIO(_HEADER % count + text.translate(_TO_LINES)))[:, 0]
+    except ValueError:
+        return np.empty(0)
+    zeros = np.flatnonzero(values == 0)
+    if zeros.size:
+        starts = np.flatnonzero((before == _SPACE) & (after != _SPACE)) + 1
+        starts = starts if kinds[0] == _SPACE else np.append(0, starts)
+        values[zeros] = np.where(np.frombuffer(text, np.uint8)[starts[zeros]] == ord("-"), -0.0, 0.0)
+    return values
+
+
+def _parse_words(text: bytes) -> np.ndarray:
+    """The numbers of a text; of another count than its words if one of them is no number."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy before 2.3 warns instead of raising ValueError
+            return np.fromstring(text, dtype=np.float64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        return np.empty(0)
