@@ -72,8 +72,8 @@ def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:
 def _read(text: Text) -> BundleProblem:
     counts: list[int] = []
     ends = [3]
-    columns = [np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2))]
-    numbers = [np.empty((0, CAMERA_SIZE)), np.empty((0, POINT_SIZE))]
+    camera_index, point_index, pixels = np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2))
+    cameras, points = np.empty((0, CAMERA_SIZE)), np.empty((0, POINT_SIZE))
     for block in text.number_blocks(partial(_field, ())):
         counts += text.integers(range(block.start, min(block.stop, 3)), 1, LARGEST_COUNT).tolist()
         if len(counts) < 3:
@@ -81,16 +81,14 @@ def _read(text: Text) -> BundleProblem:
         text.field = partial(_field, counts)
         ends = np.cumsum([3, 4 * counts[2], CAMERA_SIZE * counts[0], POINT_SIZE * counts[1]]).tolist()
         start, stop = (min(max(ends[0], at), ends[1]) - 3 for at in (block.start, block.stop))
-        for column in columns:
-            _make_room(column, -(-stop // 4), counts[2])
-        targets = (*columns[:2], *columns[2].T)
-        for part, target in enumerate(targets):
+        for array in (camera_index, point_index, pixels):
+            _make_room(array, -(-stop // 4), counts[2])
+        for part, target in enumerate((camera_index, point_index, *pixels.T)):
             first = start + (part - start) % 4
             ordinals = range(3 + first, 3 + stop, 4)
             found = text.integers(ordinals, 0, counts[part] - 1) if part < 2 else text.at(ordinals)
             target[first // 4 : first // 4 + len(found)] = found
-        del target, targets
-        for array, total, begin, end in zip(numbers, counts, ends[1:], ends[2:], strict=False):
+        for array, total, begin, end in zip((cameras, points), counts, ends[1:], ends[2:], strict=False):
             start, stop = (min(max(begin, at), end) for at in (block.start, block.stop))
             _make_room(array, -((begin - stop) // array.shape[1]), total)
             array.ravel()[start - begin : stop - begin] = text.at(range(start, stop))
@@ -99,7 +97,7 @@ def _read(text: Text) -> BundleProblem:
     text.need(ends[-1] if len(counts) == 3 else 3)
     text.finish(ends[-1])
     try:
-        return BundleProblem.create(*numbers, columns[2], *columns[:2])
+        return BundleProblem.create(cameras, points, pixels, camera_index, point_index)
     except ProblemError as error:
         raise ProblemError(f"{text.name}: {error}") from error
 

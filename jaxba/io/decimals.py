@@ -103,7 +103,7 @@ def _parse_lines(text: bytes, kinds: np.ndarray, count: int) -> np.ndarray:
     if torn.any() or any(bytes(one) in parts for one in wrong):
         return np.empty(0)
     try:
-        values = mmread(io.BytesIO(_HEADER % count + text.translate(_TO_LINES)))[:, 0]
+        values = np.asarray(mmread(io.BytesIO(_HEADER % count + text.translate(_TO_LINES)))).ravel()
     except ValueError:
         return np.empty(0)
     zeros = np.flatnonzero(values == 0)

@@ -78,6 +78,6 @@ def note_center(path: StrPath, what: str, center: tuple[float, float], size: tup
 def note_origin(path: StrPath, pixels: Float[np.ndarray, "n 2"]) -> None:
     """Warns if all pixels lie in one quadrant, as they do from a corner of the image; the formats have its centre."""
     x, y = pixels.T
-    if len(pixels) >= LEAST_PIXELS and (x >= 0).all() and ((y >= 0).all() or (y <= 0).all()):
+    if len(pixels) >= LEAST_PIXELS and x.min() >= 0 and (y.min() >= 0 or y.max() <= 0):
         extent = f"x in {x.min():g}..{x.max():g}, y in {y.min():g}..{y.max():g}"
         note(path, f"pixels seem to be measured from a corner of the image ({extent}), not from its centre")

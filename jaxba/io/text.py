@@ -55,6 +55,7 @@ class Text:
         self._pieces, self._text, self._at = iter(pieces), b"", 0  # what follows, and where in it the next line begins
         self._blocks: list[tuple[int, int, bytes]] = []  # those kept: ordinal of the first number, lines before, text
         self._start = self._count = 0  # ordinals of the first number that is kept, and of the next one to read
+        self._last = 0, b""  # lines before the last block that is not blank, and its text
         self._complaint: str | None = None  # about the word after the last number
 
     @property
@@ -87,6 +88,7 @@ class Text:
     def number_blocks(self, field: Callable[[int], str]) -> Iterator[range]:
         """Parses the same a block at a time. Yields ordinals of its numbers, which until the next one are `values`."""
         self.field, lines, last = field, self.line, False
+        self._last = max(lines - 1, 0), b""
         while not last and self._complaint is None:
             while not (space := _SPACE.search(self._text, self._at + BLOCK_BYTES)) and self._more():
                 pass
@@ -95,9 +97,9 @@ class Text:
             text, self._at = self._text[self._at : end], end
             self._blocks, self._start = [(self._count, lines, text)], self._count
             self.values, self._complaint = parse(text)
-            if self.values.size or self._complaint:
-                self.line = lines + text.rstrip().count(b"\n") + 1  # the last one that is not blank
-            lines += text.count(b"\n")
+            if self.values.size:
+                self._last = lines, text
+            lines += int(np.count_nonzero(np.frombuffer(text, np.uint8) == ord("\n")))
             self._count += len(self.values)
             yield range(self._start, self._count)
 
@@ -106,7 +108,8 @@ class Text:
         if count > self._count and self._complaint is not None:
             self.fail(self._count, self._complaint)
         if count > self._count:
-            raise ProblemError(f"{self.where}: the file ends before the {self.field(self._count)}")
+            line = self._last[0] + self._last[1].rstrip().count(b"\n") + 1
+            raise ProblemError(f"{self.name} line {line}: the file ends before the {self.field(self._count)}")
 
     def finish(self, count: int) -> None:
         """Refuses a text in which a word follows so many numbers. Raises ProblemError."""

@@ -214,9 +214,9 @@ def _floats(name: str, values: Any, width: int) -> np.ndarray:
     array = real_numbers(name, values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ProblemError(f"{name} must have shape (n, {width}), not {array.shape}")
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if bad.size:
-        raise ProblemError(f"{name}[{bad[0]}] is not finite: {array[bad[0]].tolist()}")
+    if array.size and not np.isfinite([array.min(), array.max()]).all():  # without an array as large for this
+        bad = np.isfinite(array).all(axis=1).argmin()
+        raise ProblemError(f"{name}[{bad}] is not finite: {array[bad].tolist()}")
     return array
 
 

@@ -47,9 +47,9 @@ def indices(name: str, values: Any, bound: int, count: int) -> Int[np.ndarray, "
     array = plain_array(name, values)
     if array.shape != (count,) or (count and array.dtype.kind not in "iu"):
         raise ValueError(f"{name} must be a vector of {count} integers, not {array.dtype} of shape {array.shape}")
-    bad = np.flatnonzero((array < 0) | (array >= bound))
-    if bad.size:
-        raise ValueError(f"{name}[{bad[0]}] is {array[bad[0]]}, outside 0..{bound - 1}")
+    if count and (array.min() < 0 or array.max() >= bound):
+        bad = np.flatnonzero((array < 0) | (array >= bound))[0]
+        raise ValueError(f"{name}[{bad}] is {array[bad]}, outside 0..{bound - 1}")
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
