@@ -73,7 +73,7 @@ def observation_lines(
 
     complex_pixels = np.ascontiguousarray(pixels, np.float64).view(np.complex128)[:, 0]
     entries = coo_array((complex_pixels, (camera_index, point_index)))
-    entries.coords = (camera_index - np.int32(1), point_index - np.int32(1))  # the format counts from 1
+    entries.row, entries.col = camera_index - np.int32(1), point_index - np.int32(1)  # the format counts from 1
     return _written(entries)
 
 
