@@ -81,7 +81,7 @@ def read_pieces(path: StrPath, decompress: bool = True) -> Iterator[bytes]:
     name = display_name(path)
     try:
         with open(path, "rb") as file:
-            begin = file.read(_PIECE)
+            begin = file.read(_PIECE if decompress else -1)
             kind = _compression(begin) if decompress else None
             suffix = os.path.splitext(path)[1].lower()
             if begin and decompress and suffix in _MAGIC and kind is None:

@@ -201,7 +201,16 @@ def _point_field(point: int, at: int) -> str:
 
 def numbered(index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """For each entry how many of the same value stand before it: numbers of key-points, from an index of cameras."""
-    order, counts = np.argsort(index, kind="stable"), np.bincount(index)
-    numbers = np.empty(len(index), np.int64)
-    numbers[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    counts = np.bincount(index)
+    numbers = np.arange(len(index), dtype=np.int32)
+    numbers -= np.repeat((np.cumsum(counts) - counts).astype(np.int32), counts)
+    numbers[grouped(index, len(counts))] = numbers.copy()
     return numbers
+
+
+def grouped(index: Int[np.ndarray, " n"], bound: int) -> Int[np.ndarray, " n"]:
+    """`argsort(index, kind="stable")` of an index below a bound, in linear time."""
+    from scipy.sparse import csr_array
+
+    rows = np.arange(len(index) + 1, dtype=np.int32)
+    return csr_array((np.ones(len(index), np.int8), index, rows), shape=(len(index), bound)).tocsc().indices

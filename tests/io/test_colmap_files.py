@@ -120,7 +120,7 @@ def test_what_is_read_from_binary_files_gives_their_bytes(tmp_path, kind):
     written = dict(binary.encode(read_model(folder)))
     assert sorted(written) == sorted(f"{part}.bin" for part in FILES)
     for name, content in written.items():
-        assert content == (folder / name).read_bytes(), name
+        assert b"".join(content) == (folder / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("form", [binary, text])
@@ -129,7 +129,7 @@ def test_what_is_written_colmap_reads_with_the_same_numbers(tmp_path, layout, fo
     model = read_model(write(synthetic(num_cameras_per_rig=2), tmp_path / "m", layout))
     (tmp_path / "out").mkdir()
     for name, content in form.encode(model):
-        (tmp_path / "out" / name).write_bytes(content)
+        (tmp_path / "out" / name).write_bytes(b"".join(content))
     same_numbers(model, pycolmap.Reconstruction(str(tmp_path / "out")))
 
 

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pytest
@@ -340,14 +341,14 @@ def test_a_model_that_a_full_disk_cuts_short_replaces_nothing(tmp_path, monkeypa
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
     problem = read_problem(folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    write_bytes = Path.write_bytes
+    as_ever = Path.open
 
-    def full(path: Path, data: bytes) -> int:
-        if path.name == "rigs.bin":
+    def full(path: Path, mode: str, **more: object) -> IO:
+        if path.name == "rigs.bin" and mode == "wb":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write_bytes(path, data)
+        return as_ever(path, mode, **more)
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "open", full)
     with pytest.raises(ProblemError, match=f"^cannot write {folder}: No space left on device$"):
         write_colmap(problem.replace(points=problem.points + 1), folder, like=folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+from jaxtyping import Bool, Int
+from numpy.lib.stride_tricks import sliding_window_view
 
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
@@ -17,6 +20,7 @@ from jaxba.io.files import read_bytes
 from jaxba.problem.bundle_problem import ProblemError
 
 _COUNT = struct.Struct("<Q")
+_BLOCK_POINTS = 1 << 14  # points whose bytes are put in order at once
 _LENGTH_AT = POINT.fields["length"][1] if POINT.fields else 0
 
 
@@ -77,14 +81,23 @@ class _Bytes:
 
     def records(self, smallest: int) -> Iterator[str]:
         """The place of each record of the file, each of at least `smallest` bytes; with the last one the file ends."""
+        count = self.begin(smallest)
+        for number in range(count):
+            self.about, self._named = f"{self.record} {number + 1} of {count}", False
+            yield self.about
+        self.end(count)
+
+    def begin(self, smallest: int) -> int:
+        """The number of the file's records, each of at least `smallest` bytes."""
         if not self.data:
             self.fail("is empty")
         (count,) = self.unpack(_COUNT, f"the number of {self.record}s")
         if count * smallest > self.left:
             self.fail(f"is cut short: {count} {self.record}s do not fit into its {len(self.data)} bytes")
-        for number in range(count):
-            self.about, self._named = f"{self.record} {number + 1} of {count}", False
-            yield self.about
+        return count
+
+    def end(self, count: int) -> None:
+        """Refuses bytes after the last record."""
         if self.left:
             plural = "" if self.left == 1 else "s"
             self.fail(f"is too long, by {self.left} byte{plural} after {count} {self.record}s")
@@ -107,17 +120,37 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray,
 
 
 def _read_points(file: _Bytes) -> tuple[np.ndarray, np.ndarray]:
-    heads, tracks, length_of = [], [], _COUNT.unpack_from
-    for where in file.records(POINT.itemsize):  # a track's length says where the next point is
-        start, end = file.at, file.at + POINT.itemsize
-        if end > len(file.data):
-            file.fail(f"is cut short in {where}")
-        file.at = end + TRACK.itemsize * length_of(file.data, start + _LENGTH_AT)[0]
-        if file.at > len(file.data):
-            file.fail(f"is cut short in the track of point {length_of(file.data, start)[0]}")
-        heads.append(file.data[start:end])
-        tracks.append(file.data[end : file.at])
-    return np.frombuffer(b"".join(heads), POINT), np.frombuffer(b"".join(tracks), TRACK)
+    data, count, length_of = file.data, file.begin(POINT.itemsize), _COUNT.unpack_from
+    lengths, end, first = np.empty(count, np.int64), file.at, file.at
+    for number in range(count):  # a track's length says where the next point is
+        start = end
+        if start + POINT.itemsize > len(data):
+            file.fail(f"is cut short in {file.record} {number + 1} of {count}")
+        (length,) = length_of(data, start + _LENGTH_AT)
+        end = start + POINT.itemsize + TRACK.itemsize * length
+        if end > len(data):
+            file.fail(f"is cut short in the track of point {length_of(data, start)[0]}")
+        lengths[number] = length
+    file.at = end
+    file.end(count)
+    points, tracks = np.empty(count, POINT), np.empty(lengths.sum(), TRACK)
+    for rows, elements, is_head in _blocks(lengths):
+        codes = np.frombuffer(data, np.uint8, len(is_head), first)
+        points[rows], tracks[elements] = codes[is_head].view(POINT), codes[~is_head].view(TRACK)
+        first += len(is_head)
+    return points, tracks
+
+
+def _blocks(lengths: Int[np.ndarray, " points"]) -> Iterator[tuple[slice, slice, Bool[np.ndarray, " bytes"]]]:
+    """Some points after the other, given how long their tracks are: which points and track elements they are, and which
+    of their bytes are the points', each before its track."""
+    at = 0
+    for start in range(0, len(lengths), _BLOCK_POINTS):
+        length = lengths[start : start + _BLOCK_POINTS]
+        size = POINT.itemsize + TRACK.itemsize * length
+        is_head = np.zeros(size.sum(), bool)
+        sliding_window_view(is_head, POINT.itemsize, writeable=True)[np.cumsum(size) - size] = True
+        yield slice(start, start + len(length)), slice(at, at := at + int(length.sum())), is_head
 
 
 def _read_image(file: _Bytes) -> Image:
@@ -126,11 +159,11 @@ def _read_image(file: _Bytes) -> Image:
     return replace(image, keys=file.array(KEY, f"key-points of {image}"))
 
 
-def encode(model: Model) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of the files of a model with rigs and frames."""
+def encode(model: Model) -> Iterator[tuple[str, Iterable[bytes]]]:
+    """Names and contents, in pieces, of the files of a model with rigs and frames."""
     for part, records in model.records.items():
-        yield f"{part}.bin", b"".join([_COUNT.pack(len(records)), *map(_packed, records.values())])
-    yield "points3D.bin", b"".join([_COUNT.pack(len(model.points)), *_packed_points(model)])
+        yield f"{part}.bin", chain([_COUNT.pack(len(records))], map(_packed, records.values()))
+    yield "points3D.bin", chain([_COUNT.pack(len(model.points))], _packed_points(model))
 
 
 def _packed(record: Any) -> bytes:
@@ -141,8 +174,8 @@ def _packed(record: Any) -> bytes:
 
 
 def _packed_points(model: Model) -> Iterator[bytes]:
-    heads, tracks, at = model.points.tobytes(), model.tracks.tobytes(), 0
-    for number, length in enumerate(model.points["length"].tolist()):
-        end = at + length * TRACK.itemsize
-        yield heads[number * POINT.itemsize : (number + 1) * POINT.itemsize] + tracks[at:end]
-        at = end
+    for rows, elements, is_head in _blocks(model.points["length"].astype(np.int64)):
+        codes = np.empty(len(is_head), np.uint8)
+        codes[is_head] = np.frombuffer(model.points[rows].tobytes(), np.uint8)
+        codes[~is_head] = np.frombuffer(model.tracks[elements].tobytes(), np.uint8)
+        yield codes.tobytes()

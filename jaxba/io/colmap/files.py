@@ -66,7 +66,8 @@ def write_model(model: Model, folder: StrPath, suffix: str) -> None:
     try:
         with tempfile.TemporaryDirectory(dir=beside, prefix=".jaxba-") as temporary:
             for name, content in (file for form in forms for file in _FORMS[form].encode(model)):
-                (Path(temporary) / name).write_bytes(content)
+                with (Path(temporary) / name).open("wb") as stream:
+                    stream.writelines(content)
             target.mkdir(exist_ok=True)
             for file in sorted(Path(temporary).iterdir()):
                 place = os.path.realpath(target / file.name)

@@ -12,6 +12,9 @@ from jaxtyping import Int, Shaped
 
 from jaxba.io.colmap.model import KEY, NO_POINT, Image, Model
 from jaxba.io.notes import counted
+from jaxba.io.text import grouped
+
+_SPARSEST = 8  # ids of so many numbers for each that is there are looked up in a table
 
 Views = Int[np.ndarray, "3 _"]  # image, key-point and point of each view: positions in an `Ordered`
 
@@ -40,16 +43,16 @@ def ordered(model: Model, images: list[Image]) -> Ordered:
     """Sorts the points and joins the key-points of the registered images, which are sorted by id."""
     keys = [image.keys for image in images]
     order = np.argsort(model.points["id"], kind="stable")
-    first = np.cumsum([0, *map(len, keys)])
+    first = np.cumsum([0, *map(len, keys)], dtype=np.int32)
     return Ordered(model, images, np.concatenate([np.empty(0, KEY), *keys]), first, model.points[order], order)
 
 
 def find_views(table: Ordered) -> tuple[Views, list[str]]:
     """Views, sorted by point and key-point, and notes on what was left out and where tracks say something else."""
     point, exists = _positions(table.points["id"], table.keys["point"])
-    key = np.flatnonzero(exists)
-    key = key[np.argsort(point[key], kind="stable")]
-    owner = np.repeat(np.arange(len(table.images)), np.diff(table.first_key))
+    key = np.flatnonzero(exists).astype(np.int32)
+    key = key[grouped(point[key], len(table.points))]
+    owner = np.repeat(np.arange(len(table.images), dtype=np.int32), np.diff(table.first_key))
     views = np.stack([owner[key], key, point[key]])
     dangling = np.flatnonzero(~exists & (table.keys["point"] != NO_POINT))
     name = lambda key: f"{table.key_name(key)}, point {table.keys['point'][key]}"
@@ -62,15 +65,17 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
 def _track_notes(table: Ordered, views: Views) -> list[str]:
     """Lines on points whose tracks are not those of their key-points."""
     heads, elements = table.model.points, table.model.tracks
-    point = np.repeat(np.argsort(table.order), heads["length"].astype(np.int64))
+    point = np.repeat(np.argsort(table.order).astype(np.int32), heads["length"].astype(np.int64))
     image, registered = _positions(np.array([image.id for image in table.images], np.uint32), elements["image"])
-    first, index = np.append(table.first_key, 0), elements["key"].astype(np.int64)
-    same = registered & (index < first[image + 1] - first[image])
-    place = np.where(same, first[image] + index, 0)
+    first, index = table.first_key, elements["key"]
+    same = registered & (index < np.append(np.diff(first), 0).astype(index.dtype)[image])
+    place = np.where(same, first[image] + index.astype(np.int32), 0)
     same[same] = table.keys["point"][place[same]] == table.points["id"][point[same]]
     absent = ~np.isin(elements["image"], np.array(list(table.model.images), np.uint32))
     wrong = np.flatnonzero(registered & ~same)
-    unnamed = views[2, ~np.isin(views[1], place[same])]
+    unnamed = np.ones(len(table.keys), bool)
+    unnamed[place[same]] = False
+    unnamed = views[2, unnamed[views[1]]]
 
     def element(at: int) -> str:
         seen = table.images[image[at]] if registered[at] else None
@@ -94,7 +99,15 @@ def _track_notes(table: Ordered, views: Views) -> list[str]:
 def _positions(ids: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions of numbers among sorted ids (0 where they are not), and whether they are among them."""
     if not len(ids):
-        return np.zeros(len(wanted), np.int64), np.zeros(len(wanted), bool)
-    at = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)
-    found = ids[at] == wanted
-    return np.where(found, at, 0), found
+        return np.zeros(len(wanted), np.int32), np.zeros(len(wanted), bool)
+    span = int(ids[-1]) - int(ids[0]) + 1
+    if span <= _SPARSEST * len(ids):
+        table = np.full(span + 1, -1, np.int32)
+        table[ids - ids[0]] = np.arange(len(ids))
+        at = table[np.minimum(wanted - ids[0], np.array(span, ids.dtype))]  # one below the first becomes very large
+        found = at >= 0
+    else:
+        at = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1).astype(np.int32)
+        found = ids[at] == wanted
+    at[~found] = 0
+    return at, found

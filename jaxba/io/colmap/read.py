@@ -106,7 +106,9 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     notes += counted(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
     notes += counted(model.file("rigs"), other, "sensor", "left out, no camera", name)
     keys = views[1] - table.first_key[views[0]]
-    views = np.stack([(np.cumsum(sees) - 1)[views[0]], views[1], (np.cumsum(observed) - 1)[views[2]]])
+    for row, kept in ((0, sees), (2, observed)):
+        if not kept.all():
+            views[row] = (np.cumsum(kept, dtype=np.int32) - 1)[views[row]]
     points = table.order[observed]
     problem = _problem(model, seeing, points, table.keys["xy"], views, refine_principal_point=refine_principal_point)
     return Assembled(problem, seeing, points, keys, notes)
@@ -182,10 +184,10 @@ def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     model, what = table.model, "left out, not finite"
     finite = np.asarray(np.isfinite(table.points["xyz"]).all(axis=1))
     notes = counted(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
-    views = views[:, finite[views[2]]]
-    visible = np.asarray(np.isfinite(table.keys["xy"][views[1]]).all(axis=1))
+    views = views if finite.all() else views[:, finite[views[2]]]
+    visible = np.asarray(np.isfinite(table.keys["xy"]).all(axis=1))[views[1]]
     notes += counted(model.file("images"), np.sort(views[1, ~visible]), "key-point", what, table.key_name)
-    return views[:, visible], notes
+    return views if visible.all() else views[:, visible], notes
 
 
 def _problem(
@@ -205,9 +207,10 @@ def _problem(
     image, key, point = views
     pixels = keys[key]
     if of_problem is None or of_problem.all_bal:
-        centers = np.array([camera.principal_point for camera in used])[lens[image]]
+        centers = np.array([camera.principal_point for camera in used])[lens]
         with np.errstate(over="ignore"):  # what is not finite is refused below
-            pixels = (pixels - centers) * COLMAP_FLIP[:2]
+            for axis in range(2):
+                pixels[:, axis] = (pixels[:, axis] - centers[image, axis]) * COLMAP_FLIP[axis]
     parameters = np.hstack([bal_poses([image.pose for image in images]), intrinsics[lens]])
     heads = model.points[points]
     try:

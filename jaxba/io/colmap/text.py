@@ -5,8 +5,9 @@ follows the ninth field of its line. Numbers are written with as many digits as 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -152,11 +153,12 @@ def _keys(line: _Line) -> np.ndarray:
     return keys
 
 
-def encode(model: Model) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of the files of a model with rigs and frames."""
+def encode(model: Model) -> Iterator[tuple[str, Iterable[bytes]]]:
+    """Names and contents, in pieces, of the files of a model with rigs and frames."""
     lines = {part: map(_joined, records.values()) for part, records in model.records.items()}
     for part, found in {**lines, "points3D": _point_lines(model)}.items():
-        yield f"{part}.txt", b"\n".join([f"# {', '.join(fields.FIRST[part].names)}, ...".encode(), *found, b""])
+        head = f"# {', '.join(fields.FIRST[part].names)}, ...".encode()
+        yield f"{part}.txt", (line + b"\n" for line in chain([head], found))
 
 
 def _joined(record: Any) -> bytes:

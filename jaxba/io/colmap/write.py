@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxba.io.colmap import model as records
 from jaxba.io.colmap.files import has_parts, read_model, write_model
@@ -14,7 +14,7 @@ from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model, Ri
 from jaxba.io.colmap.poses import colmap_poses, composed, inverse
 from jaxba.io.colmap.read import Assembled, assemble, place_in_rig
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.text import numbered
+from jaxba.io.text import grouped, numbered
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
@@ -24,6 +24,7 @@ from jaxba.problem.labels import part_name
 from jaxba.problem.preprocess import MIN_TRACK
 
 _NAME_DIGITS = 4  # at least, so that the names of images sort as their ids do
+_BLOCK_OBSERVATIONS = 1 << 16  # whose errors are computed at once
 _LARGEST_HALF = 2**30  # pixels; COLMAP's sizes are whole numbers, and no image is larger
 
 
@@ -92,9 +93,7 @@ def _with_points(
     heads["xyz"][assembled.points] = problem.points
     names = ("observations", "camera_index", "point_index")  # all of the model, of which some may not have counted
     problem = problem.replace(**{name: getattr(assembled.problem, name)[kept] for name in names}, whitening=None)
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = geometry.project(problem) - np.asarray(problem.observations)
-    heads["error"][assembled.points] = mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
+    heads["error"][assembled.points] = mean_errors(problem)
     return replace(model, points=heads)
 
 
@@ -217,23 +216,28 @@ def create_model(problem: BundleProblem, target: str) -> Model:
         at = f"f of {part_name(problem.labels, 'image', wrong[0])} is {cameras[wrong[0], 6]:g}"
         raise ProblemError(f"cannot write {target}: {at}, and COLMAP's focal lengths are positive")
     _, first, lens = np.unique(lenses.index, return_index=True, return_inverse=True)
-    pixels = np.asarray(valid.observations) * (COLMAP_FLIP[:2] if lenses.all_bal else 1.0)
+    by_image, by_point = grouped(camera_index, len(cameras)), grouped(point_index, valid.num_points)
+    keys = np.empty(valid.num_observations, records.KEY)
+    keys["xy"], keys["point"] = np.asarray(valid.observations)[by_image], point_index[by_image]
+    keys["point"] += 1
+    of_images = np.split(keys, np.cumsum(np.bincount(camera_index, minlength=len(cameras)))[:-1])
     half = np.ones((len(first), 2))
-    np.maximum.at(half, lens[camera_index], np.ceil(np.abs(pixels) / (1.0 if lenses.all_bal else 2.0)))
+    for at, seen in zip(lens, of_images, strict=True):
+        extent = np.abs(seen["xy"]).max(axis=0, initial=0.0)
+        half[at] = np.maximum(half[at], np.ceil(extent / (1.0 if lenses.all_bal else 2.0)))
     if half.max() > _LARGEST_HALF:
         raise ProblemError(f"cannot write {target}: a pixel is {half.max():g} from the centre of its image")
-    keys = np.empty(len(pixels), records.KEY)
-    keys["xy"], keys["point"] = pixels + (half[lens[camera_index]] if lenses.all_bal else 0.0), point_index + 1
-    by_image, by_point = (np.argsort(index, kind="stable") for index in (camera_index, point_index))
-    image_ends = np.cumsum(np.bincount(camera_index, minlength=len(cameras)))
-    tracks = np.empty(len(pixels), records.TRACK)
-    tracks["image"], tracks["key"] = camera_index[by_point] + 1, numbered(camera_index)[by_point]
+    for at, seen in zip(lens, of_images, strict=True) if lenses.all_bal else ():
+        seen["xy"] = seen["xy"] * COLMAP_FLIP[:2] + half[at]
+    tracks = np.empty(len(keys), records.TRACK)
+    tracks["image"], tracks["key"] = camera_index[by_point], numbered(camera_index)[by_point]
+    tracks["image"] += 1
     heads = np.zeros(len(valid.points), records.POINT)
     heads["id"], heads["xyz"] = np.arange(1, len(heads) + 1), valid.points
     heads["length"] = np.bincount(point_index, minlength=len(heads))
-    heads["error"] = mean_errors(geometry.residuals(valid), point_index, len(heads))
+    heads["error"] = mean_errors(valid)
     digits = max(_NAME_DIGITS, len(str(len(cameras))))
-    rows = zip(colmap_poses(cameras), lens.tolist(), np.split(keys[by_image], image_ends[:-1]), strict=True)
+    rows = zip(colmap_poses(cameras), lens.tolist(), of_images, strict=True)
     images = {
         number: Image(number, pose, of + 1, f"image{number:0{digits}d}.jpg".encode(), seen)
         for number, (pose, of, seen) in enumerate(rows, 1)
@@ -245,13 +249,15 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     return Model(target, ".bin", made, images, heads, tracks, None, None)
 
 
-def mean_errors(
-    residuals: Float[np.ndarray, "observations 2"], point_index: Int[np.ndarray, " observations"], count: int
-) -> Float[np.ndarray, " points"]:
+def mean_errors(problem: BundleProblem) -> Float[np.ndarray, " points"]:
     """Mean reprojection error of each point, pixels; -1, COLMAP's word for none, where it is not finite."""
+    total = np.zeros(problem.num_points)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        total = np.bincount(point_index, np.linalg.norm(residuals, axis=1), count)
-        mean = total / np.bincount(point_index, minlength=count)
+        for start in range(0, problem.num_observations, _BLOCK_OBSERVATIONS):
+            part = problem.subset(slice(start, start + _BLOCK_OBSERVATIONS))
+            x, y = geometry.residuals(part).T
+            np.add.at(total, part.point_index, np.sqrt(x * x + y * y))
+        mean = total / np.bincount(problem.point_index, minlength=len(total))
     return np.where(np.isfinite(mean), mean, -1.0)
 
 
