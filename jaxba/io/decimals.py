@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import re
-import warnings
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,7 +17,7 @@ _NOT_FINITE = re.compile(
     rb"[+-]?(?:nan(?:\(\w*\))?|inf(?:inity)?|\d\.#(?:[qs]nan|ind|inf)\d*)",  # the last is Microsoft's, as 1.#QNAN
     re.IGNORECASE,
 )
-_FORTRAN = re.compile(rb"[\d.][Dd][+-]?\d")  # the exponent of 1.0D+00
+_PLUS = re.compile(rb"(?<![^ \t\n\r\v\f])\+(?=[\d.])")  # before a number
 _FORTRAN_TO_C = bytes.maketrans(b"Dd", b"Ee")
 
 _DIGIT, _POINT, _SIGN, _EXPONENT, _SPACE, _OTHER = (1 << k for k in range(6))  # kinds of characters
@@ -42,27 +41,21 @@ def number(word: str) -> float:
 
 def parse(text: bytes) -> tuple[Float[np.ndarray, " n"], str | None]:
     """The numbers of a text up to the first bad word, and what is wrong with that one, if any."""
-    text = text if text[-1:].isspace() else text + b"\n"
-    kinds = np.frombuffer(text.translate(_KIND_OF), np.uint8)
-    spaces = kinds == _SPACE
-    count = int(np.count_nonzero(spaces[1:] > spaces[:-1]))  # the ends of words
-    if not count:
-        return np.empty(0), None
-    values = _parse_lines(text, kinds, count)
-    if values.size != count:
-        values = _parse_words(text.translate(_FORTRAN_TO_C) if _FORTRAN.search(text) else text)
-    if values.size != count:  # one of the words is no number: search it word by word
+    text = b"\n%b\n" % text
+    values, complaint = _parse_lines(text), None
+    if values is None:
+        values = _parse_lines(_PLUS.sub(b" ", text.translate(_FORTRAN_TO_C)))
+    if values is None:  # one of the words is no number, or not finite: search it word by word
         good = []
         for word in _WORD.findall(text):
             try:
                 good.append(number(word.decode("latin-1")))
             except ValueError:
+                complaint = "is not a number"
                 break
-        values = np.array(good, dtype=np.float64)
+        values = np.array(good, np.float64)
     finite = np.isfinite(values)
-    if not finite.all():
-        return values[: finite.argmin()], "is not a finite number"
-    return values, None if values.size == count else "is not a number"
+    return (values, complaint) if finite.all() else (values[: finite.argmin()], "is not a finite number")
 
 
 def observation_lines(
@@ -90,35 +83,26 @@ def _written(matrix: object) -> bytes:
     return file.getvalue().split(b"\n", _HEADER_LINES)[_HEADER_LINES].lower()
 
 
-def _parse_lines(text: bytes, kinds: np.ndarray, count: int) -> np.ndarray:
-    """The numbers of a text of so many words, more than none; empty if one of them is no number or begins with a plus.
+def _parse_lines(text: bytes) -> Float[np.ndarray, " n"] | None:
+    """The numbers of a text between spaces; None if one of its words is no number, or begins with a plus.
 
-    SciPy's reader takes the longest number that a line begins with, and drops the rest and the sign of zero."""
+    SciPy's reader takes the longest number that a line begins with, and drops the rest, and the sign of zero."""
     from scipy.io import mmread
 
+    kinds = np.frombuffer(text.translate(_KIND_OF), np.uint8)
     before, after = kinds[:-1], kinds[1:]
+    count = np.count_nonzero((before != _SPACE) & (after == _SPACE))
     torn = ((after == _SIGN) & (before < _EXPONENT)) | ((after == _SPACE) & (before & (_SIGN | _EXPONENT) != 0))
     parts = kinds.tobytes().translate(None, bytes([_DIGIT, _SIGN]))
     wrong = ((_OTHER,), (_POINT, _POINT), (_EXPONENT, _POINT), (_EXPONENT, _EXPONENT))
-    if torn.any() or any(bytes(one) in parts for one in wrong):
-        return np.empty(0)
+    if not count or torn.any() or any(bytes(one) in parts for one in wrong):
+        return None if count else np.empty(0)
     try:
         values = np.asarray(mmread(io.BytesIO(_HEADER % count + text.translate(_TO_LINES)))).ravel()
     except ValueError:
-        return np.empty(0)
+        return None
     zeros = np.flatnonzero(values == 0)
     if zeros.size:
         starts = np.flatnonzero((before == _SPACE) & (after != _SPACE)) + 1
-        starts = starts if kinds[0] == _SPACE else np.append(0, starts)
-        values[zeros] = np.where(np.frombuffer(text, np.uint8)[starts[zeros]] == ord("-"), -0.0, 0.0)
+        values[zeros[np.frombuffer(text, np.uint8)[starts[zeros]] == ord("-")]] = -0.0
     return values
-
-
-def _parse_words(text: bytes) -> np.ndarray:
-    """The numbers of a text; of another count than its words if one of them is no number."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # NumPy before 2.3 warns instead of raising ValueError
-            return np.fromstring(text, dtype=np.float64, sep=" ")
-    except (ValueError, DeprecationWarning):
-        return np.empty(0)
