@@ -28,9 +28,10 @@ _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translati
 def read_bal(path: StrPath) -> BundleProblem:
     """Reads a BAL file, plain or compressed by bzip2, gzip or xz (recognised by its first bytes).
 
-    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit. The path
-    may be a pipe. Raises ProblemError: the file cannot be read or is no valid problem; one line that names the file
-    and, where there is one, the line and the field."""
+    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit. The text
+    is read in blocks: beyond the problem it takes memory for a few of them. The path may be a pipe. Raises
+    ProblemError: the file cannot be read or is no valid problem; one line that names the file and, where there is one,
+    the line and the field."""
     problem = _read(Text(text_pieces(path), display_name(path)))
     note_origin(path, np.asarray(problem.observations))
     return problem
@@ -38,6 +39,8 @@ def read_bal(path: StrPath) -> BundleProblem:
 
 def write_bal(problem: BundleProblem, path: StrPath) -> None:
     """Writes a BAL file that reads back bit by bit; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
+
+    Numbers have the fewest digits that do, with exponents (`6.25e1`), and are written in blocks.
 
     The file is replaced whole or not at all. BAL cannot store covariances, weights, shared intrinsics or what is
     constant: these are **not** written, and the problem reads back without whitening and with free intrinsics of its

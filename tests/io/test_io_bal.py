@@ -300,6 +300,30 @@ def test_no_memory_is_set_aside_for_a_header_that_lies(tmp_path):
     assert peak < 4 * text.BLOCK_BYTES
 
 
+def test_reading_and_writing_take_a_few_blocks_beyond_the_problem(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", 1 << 16)
+    monkeypatch.setattr("jaxba.io.files._PIECE", 1 << 16)
+    monkeypatch.setattr("jaxba.io.bal._BLOCK_ROWS", 1 << 11)
+    problem = random_problem(0, cameras=200, points=20_000, observations=150_000)
+    path = tmp_path / "a.txt.gz"
+    write_bal(random_problem(1), path)
+    read_bal(path)  # imports and caches do not count
+    tracemalloc.start()
+    write_bal(problem, path)
+    written = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    before = tracemalloc.get_traced_memory()[0]
+    found = read_bal(path)
+    read = tracemalloc.get_traced_memory()[1] - before
+    tracemalloc.stop()
+    arrays = (found.cameras, found.points, found.observations, found.camera_index, found.point_index)
+    own = sum(array.nbytes for array in arrays)
+    assert_same_bits(found, problem)
+    assert written < 40 * (1 << 16)
+    assert read < own + 40 * (1 << 16)
+    assert len(gzip.decompress(path.read_bytes())) > 100 * (1 << 16)
+
+
 class TestWriting:
     """The file appears whole or not at all."""
 

@@ -54,6 +54,7 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
     key = key[grouped(point[key], len(table.points))]
     owner = np.repeat(np.arange(len(table.images), dtype=np.int32), np.diff(table.first_key))
     views = np.stack([owner[key], key, point[key]])
+    del owner, key, point  # large
     dangling = np.flatnonzero(~exists & (table.keys["point"] != NO_POINT))
     name = lambda key: f"{table.key_name(key)}, point {table.keys['point'][key]}"
     no_point = f"left out, of a point that {table.model.file('points3D')} does not have"
