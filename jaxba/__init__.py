@@ -35,6 +35,7 @@ from jaxba.io import (
     write_colmap,
     write_ply,
     write_problem,
+    write_transforms,
 )
 from jaxba.lm.method import StepMethod
 from jaxba.lm.records import LMState, StepInfo
@@ -200,4 +201,5 @@ __all__ = [
     "write_colmap",
     "write_ply",
     "write_problem",
+    "write_transforms",
 ]

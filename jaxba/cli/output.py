@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxba.cli import common, table
 from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
-from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem
-from jaxba.io.bal import check_bal_lenses
+from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem, write_transforms
 from jaxba.io.files import StrPath
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.solve import Solution
@@ -28,6 +27,11 @@ def is_model(output: str, source: str | None) -> bool:
 
 def _is_like_source(output: str, source: str | None) -> bool:
     return source is not None and is_colmap(source) and is_model(output, source)
+
+
+def _is_transforms(output: str, source: str | None) -> bool:
+    """Whether cameras alone are written, for nerfstudio."""
+    return not is_model(output, source) and formats.by_ending(output, written=True) is formats.TRANSFORMS
 
 
 def check_outputs(
@@ -51,21 +55,24 @@ def check_outputs(
     written = {option: [path] for option, path in others.items()}
     check_apart({"--output": solution, **written}, {what: [path] for what, path in read.items()})
     replaced = output and source and os.path.exists(output) and os.path.samefile(output, source)
+    replaced = replaced and not _is_transforms(str(output), source)  # which are cameras alone
     check_apart({"--output": [] if replaced else solution, **written}, {PROBLEM: problem_files(source)})
 
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:
     """Checks that the format of the output can hold the problem's lenses. Raises ProblemError: it cannot; one line."""
     if output and not is_model(output, source):
-        known = formats.by_ending(output)
-        if known is None or known.name != "PLY":
-            check_bal_lenses(problem, output)
+        known = formats.by_ending(output, written=True) or formats.FORMATS[0]
+        if known.check is not None:
+            known.check(problem, output)
 
 
 def store(output: str, solution: Solution, source: str | None) -> None:
     """Writes a solution, without what it rejected. Raises OSError, ProblemError: it cannot be written."""
     if _is_like_source(output, source):
         write_colmap(solution.problem, output, like=source, rejected=solution.rejected)
+    elif _is_transforms(output, source) and source is not None and is_colmap(source):
+        write_transforms(solution.problem, output, like=source)
     else:
         write_problem(fitting(solution), output)
 
@@ -80,15 +87,17 @@ def fitting(solution: Solution) -> BundleProblem:
 
 def write_solution(output: str, solution: Solution, source: str | None) -> None:
     """Writes the solution, and prints what was written and what the file cannot store. Raises UsageError: it fails."""
-    model, like = is_model(output, source), _is_like_source(output, source)
+    model, cameras = is_model(output, source), _is_transforms(output, source)
+    like = source is not None and is_colmap(source) and (model or cameras)
     try:
         store(output, solution, source)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
-    if model and not like:
-        common.print_line("note: names and sizes of images, and so principal points, are made up in that model")
+    if (model or cameras) and not like:
+        what = "model" if model else "file"
+        common.print_line(f"note: names and sizes of images, and so principal points, are made up in that {what}")
     common.print_line(f"wrote {output}")
     if formats.ending(output) and formats.by_ending(output) is None and not model:
         common.print_line(f"note: {output} is a BAL file; {formats.formats_written()}")
-    if not like and (lost := table.lost_in(solution.problem, model)):
+    if not (like or cameras) and (lost := table.lost_in(solution.problem, model)):
         common.print_line(f"note: that {'model' if model else 'file'} cannot store: {lost}")

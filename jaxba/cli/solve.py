@@ -190,9 +190,9 @@ class Output:
     """What is written and shown."""
 
     output: Annotated[str | None, "FILE"] = None
-    """Solution in BAL format, compressed by its ending; .out: Bundler's format; .ply: for a viewer; -: standard output.
-    An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem is one, except *.txt, *.bal,
-    *.out, *.ply, *.bz2, *.gz and *.xz. Of several problems: a folder."""
+    """Solution in BAL format, compressed by its ending; .out: Bundler's; .ply: for a viewer; .json: cameras for
+    nerfstudio; -: standard output. An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem
+    is one, but for these endings, .txt, .bal, .bz2, .gz and .xz. Of several problems: a folder."""
 
     resume: bool = False
     """Go on with several problems where it ended."""

@@ -16,7 +16,7 @@ from jaxba.io.colmap.read import principal_points
 from jaxba.io.control_points import read_control_points
 from jaxba.io.geodesy import Frame, in_frame, is_geographic
 from jaxba.io.notes import report
-from jaxba.io.positions import Positions, read_database, read_photos, read_table
+from jaxba.io.positions import Positions, read_database, read_photos, read_table, read_transforms
 from jaxba.model.registration import with_residual
 from jaxba.problem.alignment import alignment
 from jaxba.problem.bundle_problem import BundleProblem
@@ -148,7 +148,8 @@ def _word(value: dict[str, Any], key: str) -> str:
 def _read(problem: BundleProblem, where: str, source: str, value: Any, strict: bool) -> Positions:
     path = _beside(where, value, source)
     if source != "photos":
-        return (read_table if source == "file" else read_database)(path)
+        of_file = read_transforms if path.suffix == ".json" else read_table
+        return (of_file if source == "file" else read_database)(path)
     if problem.labels is None:
         raise ValueError("photos: the problem does not name its images")
     found = read_photos(path, names := problem.labels.names)

@@ -10,6 +10,7 @@ from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
 from jaxba.io.files import StrPath, display_name, visible
+from jaxba.io.nerfstudio import write_transforms
 from jaxba.io.ply import write_ply
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 
@@ -34,8 +35,8 @@ def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
 
 def write_problem(problem: BundleProblem, path: StrPath) -> None:
     """Writes a problem: a folder, or a name that ends in a separator, is a COLMAP model that is like no other, `.out` a
-    Bundler model, `.ply` a point cloud for viewers, every other name that is not another format's a BAL file. Files may
-    be compressed. Raises ProblemError: as `check_output` and the writers do."""
+    Bundler model, `.ply` a point cloud for viewers, `.json` cameras for nerfstudio, every other name that is not
+    another format's a BAL file. Files may be compressed. Raises ProblemError: as `check_output` and the writers do."""
     check_output(path)
     (write_colmap if is_folder(path) else formats.writer(path))(problem, path)
 

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-from jaxba.io.bal import read_bal, write_bal
+from jaxba.io.bal import check_bal_lenses, read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap
 from jaxba.io.colmap.model import PARTS, RIG_PARTS
 from jaxba.io.encoding import plain_text
 from jaxba.io.files import StrPath, beginning, display_name, strip_compression
 from jaxba.io.foreign import RECONSTRUCTION, TRACKS
+from jaxba.io.nerfstudio import check_transforms, write_transforms
 from jaxba.io.ply import write_ply
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
@@ -29,6 +30,7 @@ class Format:
     endings: tuple[str, ...]  # of its files, lower case, without compression; the first is the one to recommend
     read: Reader | None = None  # reader; None if it is only written
     write: Writer | None = None  # writer; None if it is only read
+    check: Writer | None = None  # refuses, with ProblemError, lenses that cannot be written
     begins: tuple[bytes, ...] = ()  # first bytes after blanks, by which a file without a known ending is recognised
 
 
@@ -54,12 +56,15 @@ def _read_json(path: StrPath) -> BundleProblem:
     document.fail(f"is JSON, but not of a program that is known here; {formats_read()}")
 
 
+TRANSFORMS = Format("nerfstudio's cameras", (".json",), write=write_transforms, check=check_transforms)
+
 FORMATS = (
-    Format("BAL", (".txt", ".bal"), read_bal, write_bal),
-    Format("Bundler", (".out",), read_bundler, write_bundler, (b"# Bundle file",)),
+    Format("BAL", (".txt", ".bal"), read_bal, write_bal, check_bal_lenses),
+    Format("Bundler", (".out",), read_bundler, write_bundler, check_bal_lenses, (b"# Bundle file",)),
     Format("VisualSFM", (".nvm",), _read_nvm, begins=(b"NVM_V3",)),
     Format("OpenSfM, OpenMVG or AliceVision", (".json", ".sfm"), _read_json, begins=(b"{", b"[")),
     Format("PLY", (".ply",), write=write_ply),
+    TRANSFORMS,
 )
 """Formats of files. The first is that of names whose ending says nothing. Folders are COLMAP models, or OpenSfM's."""
 
@@ -95,9 +100,10 @@ def ending(path: StrPath) -> str:
     return PurePath(strip_compression(path)).suffix.lower()
 
 
-def by_ending(path: StrPath) -> Format | None:
-    """The format that a name's ending stands for."""
-    return next((one for one in FORMATS if ending(path) in one.endings), None)
+def by_ending(path: StrPath, *, written: bool = False) -> Format | None:
+    """The format that a name's ending stands for; of two the one that is `written`, or else read."""
+    found = [one for one in FORMATS if ending(path) in one.endings]
+    return next((one for one in found if one.write or not written), found[0] if found else None)
 
 
 def is_file_name(path: StrPath) -> bool:
@@ -161,7 +167,7 @@ def recognised(path: StrPath, begin: bytes) -> str | None:
 
 def writer(path: StrPath) -> Writer:
     """What writes a file of a name. Raises ProblemError: a format that is not written; names those that are."""
-    known = by_ending(path)
+    known = by_ending(path, written=True)
     write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
     if write is None:
         of = f" of {known.name}" if known else ""

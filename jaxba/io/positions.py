@@ -1,4 +1,4 @@
-"""Measured positions of images: tables of flight logs, COLMAP's database, and the GPS of photos."""
+"""Measured positions of images: tables of flight logs, COLMAP's database, nerfstudio's file, the GPS of photos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import sqlite3
 from collections.abc import Iterable, Sequence
 from contextlib import closing
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +15,11 @@ from jaxtyping import Float
 
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.foreign.json_records import Record, read_json
+from jaxba.io.nerfstudio import IMAGES
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.geometry import are_rotations
 
 WGS84 = "EPSG:4326"  # what longitudes and latitudes are of, if nothing else is said
 
@@ -127,6 +130,30 @@ def read_database(path: StrPath) -> Positions:
     known, geographic = np.isfinite(covariances).all(), systems == {0}
     places = places[kept][:, [1, 0, 2]] if geographic else places[kept]
     return Positions([rows[at][0] for at in kept], places, covariances if known else None, WGS84 if geographic else "")
+
+
+def read_transforms(path: StrPath) -> Positions:
+    """Reads the positions of nerfstudio's frames, as phones measure them, in the world before `applied_transform` and
+    `applied_scale`. Raises ProblemError: it cannot be read, or has no frames; one line that names the field."""
+    document = read_json(path)
+    frames = list(document.get("frames").rows())
+    if not frames:
+        document.fail("has no frames")
+    places = np.array([_matrix(frame.get("transform_matrix"))[:, 3] for frame in frames])
+    applied = document.get("applied_transform", np.eye(4).tolist())
+    turn = _matrix(applied)
+    if not are_rotations(turn[None, :, :3])[0]:
+        applied.fail("has a rotation that is none")
+    places = (places / document.get("applied_scale", 1.0).number() - turn[:, 3]) @ turn[:, :3]
+    files = [PurePosixPath(frame.get("file_path").text()).parts for frame in frames]
+    return Positions(["/".join(file[file[0] == IMAGES :] if file else ()) for file in files], places, None, "")
+
+
+def _matrix(record: Record) -> Float[np.ndarray, "3 4"]:
+    rows = [row.vector(4) for row in record.rows()]
+    if len(rows) not in (3, 4):
+        record.fail("must have three or four rows")
+    return np.array(rows[:3])
 
 
 def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:

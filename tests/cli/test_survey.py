@@ -19,6 +19,7 @@ from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
 from jaxba.problem import geometry
 from jaxba.problem.labels import Labels
+from jaxba.problem.similarity import Similarity, transformed
 
 ORIGIN = (8.5, 47.3, 500.0)
 """Longitude, latitude and height of the scene's origin."""
@@ -108,6 +109,16 @@ def test_positions_on_the_earth_make_a_scene_in_metres(source, scene, tmp_path):
     if crs:
         expected = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*places.T[:2])
         np.testing.assert_allclose(centers[:, :2], np.stack(expected, axis=1), atol=0.05)
+
+
+def test_positions_of_nerfstudio_give_the_scene_their_scale(scene, tmp_path):
+    _, problem, _ = scene
+    jaxba.write_transforms(transformed(problem, Similarity(3.0, np.eye(3), np.ones(3))), tmp_path / "transforms.json")
+    (tmp_path / "c.yaml").write_text("position_priors: {file: transforms.json, stddev: 0.05}\n")
+    found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    np.testing.assert_allclose(
+        geometry.camera_centers(found.cameras), 3 * geometry.camera_centers(problem.cameras) + 1, atol=1e-9
+    )
 
 
 def test_images_are_found_by_the_names_of_their_files(scene, tmp_path):

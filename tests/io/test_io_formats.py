@@ -15,12 +15,13 @@ from jaxba.cli.solve import run
 from jaxba.io import check_output, formats, read_problem, write_colmap, write_problem
 from jaxba.problem.bundle_problem import ProblemError
 
-WRITTEN = "written are .txt, .bal (BAL), .out (Bundler), .ply (PLY), each also with .gz, .bz2 or .xz"
-
-
-@pytest.mark.parametrize(
-    "name", ["a.nvm", "a.json", "a.zip", "a.SFM", "a.abc", "a.nvm.gz", "a.npz", "a.mat", "a.tar.gz"]
+WRITTEN = (
+    "written are .txt, .bal (BAL), .out (Bundler), .ply (PLY), .json (nerfstudio's cameras), "
+    "each also with .gz, .bz2 or .xz"
 )
+
+
+@pytest.mark.parametrize("name", ["a.nvm", "a.zip", "a.SFM", "a.abc", "a.nvm.gz", "a.npz", "a.mat", "a.tar.gz"])
 def test_endings_of_other_formats_are_not_written(name, tmp_path):
     with pytest.raises(ProblemError, match="are not written; ") as caught:
         write_problem(support.tiny(), tmp_path / name)
@@ -29,7 +30,7 @@ def test_endings_of_other_formats_are_not_written(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["a", "a.txt", "a.BAL", "a.OUT.xz", "a.ply", "a.5", "/dev/stdout", "a.b.txt", "json", "a.txt.bz2"]
+    "name", ["a", "a.txt", "a.BAL", "a.OUT.xz", "a.ply", "a.json", "a.5", "/dev/stdout", "a.b.txt", "json", "a.txt.bz2"]
 )
 def test_other_names_may_be_written(name):
     check_output(name)
@@ -42,7 +43,7 @@ def tiny(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("name", ["solved.nvm", "solved.json", "solved.zip"])
+@pytest.mark.parametrize("name", ["solved.nvm", "solved.sfm", "solved.zip"])
 def test_an_output_of_another_format_is_refused_before_any_work(tiny, capsys, name):
     missing = tiny.with_name("missing.out")
     assert run([str(missing), "--output", str(tiny.with_name(name))]) == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import sys
 
@@ -11,7 +12,7 @@ from PIL import Image
 
 from jaxba import ProblemError
 from jaxba.io.geodesy import Frame, in_frame, projected
-from jaxba.io.positions import read_database, read_photos, read_table
+from jaxba.io.positions import read_database, read_photos, read_table, read_transforms
 
 PLACES = np.array([[8.5, 47.3, 500.0], [8.51, 47.31, 620.0], [8.52, 47.29, 480.0]])
 
@@ -194,3 +195,35 @@ def test_photos_have_the_position_of_their_camera(tmp_path):
     np.testing.assert_allclose(places, [[-8.51, -47.3, 500], [8.51, 47.3, -2.5]], atol=1e-9)
     with pytest.raises(ProblemError, match="no photo of the model there has a GPS position"):
         read_photos(tmp_path, ["c.jpg"])
+
+
+def test_positions_of_nerfstudio_are_in_the_world_before_its_transform(tmp_path):
+    """As its converter makes them of COLMAP's: x, z and -y of the world, then scaled."""
+    frames = [
+        {"file_path": name, "transform_matrix": [[1, 0, 0, 2 * x], [0, 1, 0, 2 * z], [0, 0, 1, -2 * y], [0, 0, 0, 1]]}
+        for name, (x, y, z) in zip(("./images/a.jpg", "images/left/b.jpg", "c.jpg"), PLACES.tolist(), strict=True)
+    ]
+    applied = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
+    (file := tmp_path / "transforms.json").write_text(
+        json.dumps({"frames": frames, "applied_transform": applied, "applied_scale": 2})
+    )
+    names, places, covariances, crs = read_transforms(file)
+    assert names == ["a.jpg", "left/b.jpg", "c.jpg"]
+    np.testing.assert_array_equal(places, PLACES)
+    assert (covariances, crs) == (None, "")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"frames": []}', "transforms.json: has no frames"),
+        ('{"frames": [{"file_path": "a"}]}', "transforms.json: frames[0] has no transform_matrix"),
+        ('{"frames": [{"transform_matrix": [[1, 2, 3, 4]]}]}', "transform_matrix must have three or four rows"),
+        ('{"frames": [{"transform_matrix": [[1, 2], [3, 4], [5, 6]]}]}', "transform_matrix[0] must be a list of 4"),
+    ],
+)
+def test_bad_frames_of_nerfstudio_are_one_line(text, message, tmp_path):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(ProblemError) as caught:
+        read_transforms(tmp_path / "transforms.json")
+    assert message in str(caught.value)

@@ -86,7 +86,7 @@ def principal_points(folder: StrPath, images: Iterable[int]) -> Float[np.ndarray
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
     """The problem of a model, whose principal points are optimised if asked for. Raises ProblemError: it is not known
     where a camera is in its rig, a lens cannot be used, or nothing is observed."""
-    images, notes = _registered(model)
+    images, notes = registered(model)
     table = ordered(model, images)
     for camera in sorted({image.camera for image in images}):
         if wrong := model.cameras[camera].impossible:
@@ -140,7 +140,7 @@ def _posed(model: Model, image: Image) -> Image:
     return replace(image, pose=composed(place_in_rig(model, frame, image.camera), frame.pose))
 
 
-def _registered(model: Model) -> tuple[list[Image], list[str]]:
+def registered(model: Model) -> tuple[list[Image], list[str]]:
     """Registered images by id, in poses of their frames; notes on others. Raises ProblemError as `place_in_rig`."""
     images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:

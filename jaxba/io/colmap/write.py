@@ -59,21 +59,28 @@ def write_colmap(
             raise ValueError("rejected is for a model that is like another one: write problem.subset(~rejected)")
         write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
-    model, target = read_model(like), display_name(folder)
-    bal = problem.lenses is None or problem.lenses.all_bal
-    assembled = assemble(model, refine_principal_point=not bal)
+    target = display_name(folder)
+    model, assembled = with_problem(read_model(like), problem, target)
     old = assembled.problem
-    if (problem.num_cameras, problem.num_points) != (old.num_cameras, old.num_points):
-        raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(like)}")
     gone = np.zeros(old.num_observations, bool) if rejected is None else np.asarray(rejected)
     if gone.shape != (old.num_observations,):
         raise ValueError(f"rejected must have {old.num_observations} entries, has shape {gone.shape}")
     text = model.suffix == ".txt" and not has_parts(folder, ".bin")  # COLMAP ignores text files beside a binary model
-    _check_finite(model, assembled, problem, target)
-    model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
-    model = _with_poses(_with_places(model, assembled, problem), assembled, problem)
     model = _without(_with_points(model, assembled, problem, ~gone), assembled, gone)
     write_model(_with_rigs(model), folder, ".txt" if text else ".bin")
+
+
+def with_problem(model: Model, problem: BundleProblem, target: str) -> tuple[Model, Assembled]:
+    """A model with the lenses, poses and places in rigs of a problem that was made of it, and what it was made of.
+    `target` is what messages say is written. Raises ProblemError: another model's problem, or unstorable."""
+    bal = problem.lenses is None or problem.lenses.all_bal
+    assembled = assemble(model, refine_principal_point=not bal)
+    old = assembled.problem
+    if (problem.num_cameras, problem.num_points) != (old.num_cameras, old.num_points):
+        raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(model.folder)}")
+    _check_finite(model, assembled, problem, target)
+    model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
+    return _with_poses(_with_places(model, assembled, problem), assembled, problem), assembled
 
 
 def _check_finite(model: Model, assembled: Assembled, problem: BundleProblem, target: str) -> None:
