@@ -68,6 +68,7 @@ from jaxba.typing import register_pytree
 
 if TYPE_CHECKING:
     from jaxba import residuals
+    from jaxba.constraints.file import survey
     from jaxba.io.reconstruction import from_pycolmap
     from jaxba.results.alternation import solve_and_retriangulate
     from jaxba.results.bundle_adjustment import bundle_adjustment
@@ -87,6 +88,7 @@ __version__ = "0.1.0"
 
 _LATE = {
     "results.alternation": ("solve_and_retriangulate",),
+    "constraints.file": ("survey",),
     "io.reconstruction": ("from_pycolmap",),
     "results.bundle_adjustment": ("bundle_adjustment",),
     "results.covariance": ("Covariance", "covariance"),
@@ -188,6 +190,7 @@ __all__ = [
     "solve_loop",
     "solve_many",
     "solve_recipes",
+    "survey",
     "train",
     "trained_step",
     "view",

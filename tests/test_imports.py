@@ -20,8 +20,8 @@ import jaxba
 
 ORDER = (
     *("typing", "runtime", "rotations", "problem", "residuals", "io", "settings", "structure", "model", "linear"),
-    *("refinement", "lm", "damping", "solver", "results", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti"),
-    *("game", "training", "peers", "bench", "paper", "cli"),
+    *("refinement", "lm", "damping", "solver", "results", "constraints", "scenes", "datasets", "viewer", "jaxba"),
+    *("methods", "kitti", "game", "training", "peers", "bench", "paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 

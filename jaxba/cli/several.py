@@ -19,6 +19,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import formats, is_colmap
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.checks import counted
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
 from jaxba.solver.many import Result, solve_many
@@ -118,7 +119,7 @@ def solve_all(
     failed = len(rows) - len(solved)
     total = lambda name: sum(float(getattr(row, name)) for row in solved)
     common.print_line(
-        f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
+        f"{counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
         f"cost {total('initial_cost'):.6g} -> {total('final_cost'):.6g} in all, "
         f"{total('iterations') / max(1, len(solved)):.1f} iterations each"
     )
@@ -159,12 +160,9 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 def _written(name: str, source: str) -> str:
     """A name, as a BAL file if the format of its ending is only read."""
-    if not is_colmap(source):
-        try:
-            formats.writer(name)
-        except ProblemError:
-            return f"{name}.txt"
-    return name
+    known = formats.by_ending(name)
+    lost = formats.ending(name) in formats.OTHER_ENDINGS if known is None else known.write is None
+    return f"{name}.txt" if lost and not is_colmap(source) else name
 
 
 def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], *, resume: bool) -> dict[str, list[str]]:

@@ -15,24 +15,26 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from jaxba.cli import common, processes, survey_report, table, view
+from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import surveyed
 from jaxba.cli.options import options, parse
 from jaxba.cli.output import check_outputs, check_storable, fitting, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
+from jaxba.constraints.file import Survey
+from jaxba.constraints.report import report
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
 from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.checks import counted
 from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.gauge import Gauge
 from jaxba.problem.hold import hold
 from jaxba.problem.losses import Loss
-from jaxba.problem.marks import Marks
 from jaxba.problem.options import ConjugateGradients, Intrinsics, LinearSolverChoice, Preconditioner, Rotation, Scaling
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
@@ -353,7 +355,8 @@ def _solve(args: Arguments) -> int:
     common.require(not args.resume, "--resume is for several problems")
     from jaxba.runtime.distributed import together
 
-    path, problem, marks = together(lambda: _checked(args))
+    path, survey = together(lambda: _checked(args))
+    problem = survey.problem
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
@@ -364,18 +367,19 @@ def _solve(args: Arguments) -> int:
     common.print_line(table.summary(problem, solution, options.loss))
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
-    rows = survey_report.rows_of(solution.problem, marks)
-    if rows:
-        common.print_line(survey_report.text(rows))
+    found = survey.report(solution)
+    if found.rows:
+        common.print_line(str(found))
     if args.survey:
-        survey_report.write(args.survey, rows)
+        found.write(args.survey)
+        common.print_line(f"wrote {args.survey}")
+    own = survey.without_marks(solution)
     if args.output:
-        own = solution if marks is None else replace(solution, problem=marks.without(solution.problem))
         write_solution(args.output, own, path)
     if args.covariance:
         solved = fitting(solution)
         solved = hold(solved, lenses="all") if args.intrinsics == "fixed" else solved
-        _write_covariance(args.covariance, solved, options.loss, 0 if marks is None else len(marks.names))
+        _write_covariance(args.covariance, solved, options.loss, fitting(own).num_points)
     if args.log:
         from jaxba.io import json_lines
         from jaxba.solver.record import record_of
@@ -393,9 +397,9 @@ def _is_divided(args: Arguments) -> bool:
     return args.devices is not None or args.processes is not None or args.distributed
 
 
-def _checked(args: Arguments) -> tuple[str | None, BundleProblem, Marks | None]:
-    """The path of the problem, the problem and its marks, after all checks of files; the first process does this for
-    all."""
+def _checked(args: Arguments) -> tuple[str | None, Survey]:
+    """The path of the problem, and the problem with what the options say of it, after all checks of files; the first
+    process does this for all."""
     path = _path(args.problem)
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")
@@ -407,28 +411,29 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem, Marks | None]:
     if args.view:
         common.check_extra(view.VIEWER)
     with common.notes_printed():
-        problem, marks = _constrained(args, path)
-    common.require(marks is None or not args.reject, "--reject is not for a file of control points")
-    known = not args.survey or survey_report.rows_of(problem, marks)
+        survey = _constrained(args, path)
+    problem = survey.problem
+    common.require(survey.marks is None or not args.reject, "--reject is not for a file of control points")
+    known = not args.survey or report(problem, survey.marks).rows
     common.require(bool(known), "--survey needs control points or distances in the file of --constraints")
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and not problem.residuals:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
-    return path, problem, marks
+    return path, survey
 
 
-def _constrained(args: Arguments, path: str | None) -> tuple[BundleProblem, Marks | None]:
-    """A problem with what is constant or measured, and its marks; without a path the built-in scene."""
+def _constrained(args: Arguments, path: str | None) -> Survey:
+    """A problem with what is constant or measured; without a path the built-in scene."""
     problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
     return surveyed(problem, args.constant, args.gauge, args.constraints, strict=args.strict, path=path)
 
 
 def _one_of_several(args: Arguments, path: str) -> BundleProblem:
-    problem, marks = _constrained(args, path)
-    common.require(marks is None, "a file of control points is for one problem")
-    return problem
+    survey = _constrained(args, path)
+    common.require(survey.marks is None, "a file of control points is for one problem")
+    return survey.problem
 
 
 def _path(problem: str | None) -> str | None:
@@ -448,8 +453,8 @@ def _read(args: Arguments, path: str) -> BundleProblem:
     return read_problem(path, strict=args.strict)
 
 
-def _write_covariance(path: str, problem: BundleProblem, loss: Loss, marks: int) -> None:
-    """Writes covariances, but for the last points, which are so many marks."""
+def _write_covariance(path: str, problem: BundleProblem, loss: Loss, points: int) -> None:
+    """Writes covariances, of so many points; the others are marks."""
     from jaxba.results.covariance import covariance
 
     with common.notes_printed():
@@ -459,8 +464,7 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss, marks: int)
     if (labels := problem.labels) is not None:
         ids = {"image_names": np.array(labels.names), "image_ids": labels.images}
         arrays |= ids | {"camera_ids": labels.lenses, "point_ids": labels.points}
-    own = slice(problem.num_points - marks)
-    arrays |= {name: value[own] for name, value in arrays.items() if name.startswith("point")}
+    arrays |= {name: value[:points] for name, value in arrays.items() if name.startswith("point")}
     with open_output(path) as file:
         np.savez_compressed(file, **arrays)
     common.print_line(f"wrote {path}")
@@ -487,7 +491,7 @@ def _by_recipes(
     with common.notes_printed():
         found = solve_recipes(problem, args.recipes or 1, policy, options)
     for name, one in zip((args.policy, *RECIPES[1:]), found, strict=False):
-        common.print_line(f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}")
+        common.print_line(f"{name}: cost {one.final_cost:.6e} after {counted(one.iterations, 'iteration')}")
     return min(found, key=lambda one: one.final_cost), []
 
 

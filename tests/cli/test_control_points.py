@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import support
-from drone_block import CHECKS, CONTROLS, RTK, SURVEYED, Block, drone_block
+from drone_block import CHECKS, CLICKED, CONTROLS, RTK, SURVEYED, Block, drone_block
 
 import jaxba
-from jaxba import ProblemWarning
+from jaxba import ProblemError, ProblemWarning
 from jaxba.cli.common import UsageError
 from jaxba.cli.constraints import surveyed
 from jaxba.cli.solve import run
@@ -38,7 +38,8 @@ def told(file: Path, folder: Path, **more) -> tuple:
     """The problem of a model with what a file says, and its marks."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProblemWarning)
-        return surveyed(jaxba.read_colmap(folder), (), None, str(file), path=str(folder), **more)
+        found = surveyed(jaxba.read_colmap(folder), (), None, str(file), path=str(folder), **more)
+    return found.problem, found.marks
 
 
 def rms(values: np.ndarray) -> float:
@@ -65,6 +66,52 @@ def test_the_written_model_has_no_point_more_or_less(solved):
     assert (after.point_index == before.point_index).all()
 
 
+def test_a_survey_from_python_is_that_of_the_command(solved, tmp_path):
+    """A mapping with numbers, and files elsewhere, gives the scene, the report and the model of the file."""
+    folder, text = solved.folder, (solved.folder / "c.yaml").read_text()
+    checks = [f"gcp{one}" for one in range(CONTROLS, CONTROLS + CHECKS)]
+    assert f"stddev: {SURVEYED}, pixels: {CLICKED}, check: [{', '.join(checks)}]" in text
+    accuracy = {"stddev": np.full(3, SURVEYED), "pixels": CLICKED}
+    constraints = {
+        "position_priors": {"file": str(folder / "log.csv"), "align": True},
+        "control_points": {"file": folder / "gcp_list.txt", "check": checks, **accuracy},
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProblemWarning)
+        found = jaxba.survey(jaxba.read_colmap(folder / "model"), constraints, model=folder / "model")
+    solution = jaxba.solve(found.problem, "ceres")
+    report = found.report(solution)
+    with open(folder / "survey.csv") as file:
+        for row, own in zip(csv.DictReader(file), report.rows, strict=True):
+            assert (row["kind"], row["name"], int(row["images"])) == (own.kind, own.name, own.images)
+            np.testing.assert_allclose([float(row[f"d{axis}"]) for axis in "xyz"], own.difference, atol=1e-6)
+    differences = np.array([row.difference for row in report.rows])[CONTROLS:]
+    assert found.marks is not None
+    np.testing.assert_array_equal(differences, solution.problem.points[-CHECKS:] - found.marks.places[CONTROLS:])
+    flat = np.hypot(rms(differences[:, 0]), rms(differences[:, 1]))
+    assert f"check points: RMS {flat:.4f} horizontally, {rms(differences[:, 2]):.4f} vertically" in str(report)
+    jaxba.write_colmap(found.without_marks(solution).problem, tmp_path / "out", like=folder / "model")
+    of_command, of_python = (jaxba.read_colmap(one) for one in (folder / "out", tmp_path / "out"))
+    np.testing.assert_allclose(of_command.points, of_python.points, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("constraints", "message"),
+    [
+        ({"gauge": "none"}, "constraints: gauge: must be one of free, two-cameras, three-points, not 'none'"),
+        ({"gauges": "free"}, "constraints: unknown key 'gauges'; there are"),
+        ({"position_priors": {"file": "gone.csv"}}, "constraints: position_priors: cannot read"),
+        ({"control_points": {"file": "gcp_list.txt"}}, "needs the COLMAP model of the problem"),
+        ({"constant_points": [True]}, "constraints: constant_points: there is no point 'true'"),
+    ],
+)
+def test_mistakes_from_python_are_one_line_that_names_the_key(constraints, message, block):
+    with pytest.raises(ProblemError) as caught:
+        jaxba.survey(jaxba.read_colmap(block.folder / "model"), constraints)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("refined", [False, True])
 def test_a_mark_with_the_pixels_of_a_point_is_where_that_is(refined, solved, tmp_path):
     """With BAL's lenses, whose pixels count from the principal point, and with COLMAP's."""
@@ -77,8 +124,10 @@ def test_a_mark_with_the_pixels_of_a_point_is_where_that_is(refined, solved, tmp
     (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
     (tmp_path / "c.yaml").write_text(f"control_points: {{file: gcp_list.txt, check: [{', '.join(map(str, points))}]}}")
     problem = jaxba.read_colmap(folder, refine_principal_point=refined)
-    found, marks = surveyed(problem, (), None, str(tmp_path / "c.yaml"), path=str(folder))
-    np.testing.assert_allclose(found.points[-3:], problem.points[list(map(int, marks.names))], atol=1e-3)
+    found = jaxba.survey(problem, tmp_path / "c.yaml", model=None if refined else folder)
+    assert found.marks is not None
+    own = problem.points[list(map(int, found.marks.names))]
+    np.testing.assert_allclose(found.problem.points[-3:], own, atol=1e-3)
 
 
 def test_the_report_is_printed(solved, capsys):
@@ -178,11 +227,12 @@ def test_points_of_other_images_are_left_out(block, tmp_path):
     (tmp_path / "c.yaml").write_text("control_points: {file: gcp_list.txt, check: gcp0}\n")
     folder = block.folder / "model"
     with pytest.warns(ProblemWarning) as notes:
-        problem, marks = surveyed(jaxba.read_colmap(folder), (), None, str(tmp_path / "c.yaml"), path=str(folder))
+        found = jaxba.survey(jaxba.read_colmap(folder), tmp_path / "c.yaml", model=folder)
     said = "\n".join(str(one.message) for one in notes)
     assert "left out pixels of 1 image that the problem does not have: other" in said
     assert "left out 1 point in fewer than two images of the problem: once" in said
-    assert marks.names == ("gcp0",)
-    assert not problem.residuals
+    assert found.marks is not None
+    assert found.marks.names == ("gcp0",)
+    assert not found.problem.residuals
     with pytest.raises(UsageError, match="pixels of 1 image that the problem does not have"):
         told(tmp_path / "c.yaml", folder, strict=True)

@@ -1,4 +1,4 @@
-"""What the file of `--constraints` says that was measured besides pixels, as residuals (`jaxba.residuals`)."""
+"""What a file of constraints says that was measured besides pixels, as residuals (`jaxba.residuals`)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba import residuals
-from jaxba.cli import constraint_values as values
-from jaxba.cli.common import counted
+from jaxba.constraints import values
 from jaxba.io.files import reason
 from jaxba.io.notes import report
 from jaxba.model.registration import with_residual
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.checks import counted
 from jaxba.problem.hold import every_lens
 from jaxba.problem.labels import Part
 

@@ -1,4 +1,4 @@
-"""Values in the file of `--constraints`: what each key may hold, with one line in the file's own words if it does not.
+"""Values in a file of constraints: what each key may hold, with one line in the file's own words if it does not.
 
 The file is read as text alone: `000010` is a name, and a number where a number is meant."""
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxba import residuals
-from jaxba.cli.common import print_line
-from jaxba.io.files import open_output
+from jaxba.io.files import StrPath, open_output
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.labels import part_name
 from jaxba.problem.marks import Marks, found_at
 
 NAME_WIDTH = 20  # characters of a name in the text
+
+COLUMNS = (*("kind", "name", "x", "y", "z", "length", "dx", "dy", "dz", "dlength"), "images", "pixels", "sigmas")
 
 
 class Row(NamedTuple):
@@ -31,7 +32,44 @@ class Row(NamedTuple):
     pixels: float | str = ""  # RMS
 
 
-def rows_of(problem: BundleProblem, marks: Marks | None) -> list[Row]:
+@dataclass(frozen=True)
+class Report:
+    """A survey's report, which prints as a table."""
+
+    rows: tuple[Row, ...]
+    """Control points, check points and distances."""
+
+    def __str__(self) -> str:
+        """The report in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
+        lines, checks = [], [row.difference for row in self.rows if row.kind == "check"]
+        for names, lengths in ((("x", "y", "z"), False), (("measured", "found", "less"), True)):
+            if mine := [row for row in self.rows if (row.kind == "distance") == lengths]:
+                heads = "".join(f"{one:>11}" for one in names) + "  images  pixels  sigmas"
+                lines.append(f"{'found less measured':{NAME_WIDTH}}{'':9}{heads}")
+            for row in mine:
+                by = row.difference
+                of = (*row.measured, row.measured[0] + by[0], *by) if lengths else by
+                seen = f"{row.images:>8}{'' if lengths else format(row.pixels, '.2f'):>8}{row.sigmas:8.2f}"
+                numbers = "".join(f"{one:11.4f}" for one in of)
+                lines.append(f"{row.name[:NAME_WIDTH]:{NAME_WIDTH}} {row.kind:8}{numbers}{seen}")
+        if checks:
+            east, north, up = np.sqrt(np.mean(np.square(checks), axis=0))
+            lines.append(f"check points: RMS {np.hypot(east, north):.4f} horizontally, {up:.4f} vertically")
+        return "\n".join(lines)
+
+    def write(self, path: StrPath) -> None:
+        """Writes the report as CSV. Raises ProblemError: it cannot be written."""
+        out = io.StringIO()
+        table = csv.writer(out, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for row in self.rows:
+            columns = [(*x, "") if len(x) == 3 else ("", "", "", *x) for x in (row.measured, row.difference)]
+            table.writerow((row.kind, row.name, *columns[0], *columns[1], row.images, row.pixels, row.sigmas))
+        with open_output(path) as file:
+            file.write(out.getvalue().encode())
+
+
+def report(problem: BundleProblem, marks: Marks | None) -> Report:
     """The report of a solved problem and its marks, with the points and distances of the residuals that it has."""
     first = problem.num_points - (0 if marks is None else len(marks.names))
     name = lambda one: part_name(problem.labels, "point", one).removeprefix("point ")
@@ -57,35 +95,4 @@ def rows_of(problem: BundleProblem, marks: Marks | None) -> list[Row]:
         columns = (places, found.difference, found.whitened, found.images, found.pixels)
         for kind, own, place, by, *more in zip(kinds, names, *(x.tolist() for x in columns), strict=True):
             points.append(Row(kind, own, tuple(place), tuple(by), *more))
-    return points + lengths
-
-
-def text(rows: Sequence[Row]) -> str:
-    """The report in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
-    lines, checks = [], [row.difference for row in rows if row.kind == "check"]
-    for names, lengths in ((("x", "y", "z"), False), (("measured", "found", "less"), True)):
-        if mine := [row for row in rows if (row.kind == "distance") == lengths]:
-            heads = "".join(f"{one:>11}" for one in names)
-            lines.append(f"{'found less measured':{NAME_WIDTH}}{'':9}{heads}{'images':>8}{'pixels':>8}{'sigmas':>8}")
-        for row in mine:
-            of = (*row.measured, row.measured[0] + row.difference[0], *row.difference) if lengths else row.difference
-            seen = f"{row.images:>8}{'' if lengths else format(row.pixels, '.2f'):>8}{row.sigmas:8.2f}"
-            numbers = "".join(f"{one:11.4f}" for one in of)
-            lines.append(f"{row.name[:NAME_WIDTH]:{NAME_WIDTH}} {row.kind:8}{numbers}{seen}")
-    if checks:
-        east, north, up = np.sqrt(np.mean(np.square(checks), axis=0))
-        lines.append(f"check points: RMS {np.hypot(east, north):.4f} horizontally, {up:.4f} vertically")
-    return "\n".join(lines)
-
-
-def write(path: str, rows: Sequence[Row]) -> None:
-    """Writes the report as CSV, and says so. Raises ProblemError: it cannot be written."""
-    out = io.StringIO()
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(("kind", "name", "x", "y", "z", "length", "dx", "dy", "dz", "dlength", "images", "pixels", "sigmas"))
-    for row in rows:
-        columns = [(*x, "") if len(x) == 3 else ("", "", "", *x) for x in (row.measured, row.difference)]
-        table.writerow((row.kind, row.name, *columns[0], *columns[1], row.images, row.pixels, row.sigmas))
-    with open_output(path) as file:
-        file.write(out.getvalue().encode())
-    print_line(f"wrote {path}")
+    return Report((*points, *lengths))

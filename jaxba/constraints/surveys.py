@@ -1,4 +1,4 @@
-"""What the file of `--constraints` says of surveys: positions of images on the earth, and ground control points."""
+"""What a file of constraints says of surveys: positions of images on the earth, and ground control points."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 
 from jaxba import residuals
-from jaxba.cli import constraint_values as values
-from jaxba.cli.common import counted
-from jaxba.cli.measurements import leave_out, parts_of
+from jaxba.constraints import values
+from jaxba.constraints.measurements import leave_out, parts_of
 from jaxba.io.colmap.read import principal_points
 from jaxba.io.control_points import read_control_points
+from jaxba.io.files import StrPath
 from jaxba.io.geodesy import Frame, in_frame, is_geographic
 from jaxba.io.notes import report
 from jaxba.io.positions import Positions, read_database, read_photos, read_table, read_transforms
 from jaxba.model.registration import with_residual
 from jaxba.problem.alignment import alignment
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.checks import counted
 from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.hold import every_lens
 from jaxba.problem.losses import Loss
@@ -64,13 +65,14 @@ def with_positions(
 
 
 def with_control_points(
-    problem: BundleProblem, where: str, value: Any, strict: bool, frame: Frame | None, path: str | None
+    problem: BundleProblem, where: str, value: Any, strict: bool, frame: Frame | None, model: StrPath | None
 ) -> tuple[BundleProblem, Marks]:
     """The problem of a COLMAP model with the marks of a file, at places in the frame of the scene, which is moved there
     unless something else was measured already; and the marks. The rest is as for `with_measured`."""
     values.parse_mapping(value, ["file"], ["check", "pixels", "crs", "stddev", "loss", "loss_scale", "align"])
-    if problem.labels is None or path is None:
-        raise ValueError("the problem does not name its images: a file of control points needs a COLMAP model")
+    bal = every_lens(problem).all_bal
+    if problem.labels is None or (bal and model is None):
+        raise ValueError("a file of control points needs the COLMAP model of the problem")
     sigma = float(values.parse_numbers("pixels", value.get("pixels", "1"), "a positive number", ()))
     if sigma <= 0:
         raise ValueError(f"pixels: must be a positive number, not {sigma:g}")
@@ -97,8 +99,8 @@ def with_control_points(
     marks = Marks(names, places, stddev[used], np.isin(names, checks))
     seen = np.isin(given.point[kept], used)
     image, pixels = image[seen], given.pixels[kept][seen]
-    if every_lens(problem).all_bal:
-        pixels = (pixels - principal_points(path, problem.labels.images[image].tolist())) * COLMAP_FLIP[:2]
+    if bal and model is not None:
+        pixels = (pixels - principal_points(model, problem.labels.images[image].tolist())) * COLMAP_FLIP[:2]
     align = values.parse_truth("align", value.get("align", "true")) and not problem.residuals
     problem = with_marks(problem, image, np.searchsorted(used, given.point[kept][seen]), pixels, sigma)
     return _on_marks(problem, marks, values.parse_loss(value), align), marks
