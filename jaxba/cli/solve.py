@@ -413,7 +413,6 @@ def _checked(args: Arguments) -> tuple[str | None, Survey]:
     with common.notes_printed():
         survey = _constrained(args, path)
     problem = survey.problem
-    common.require(survey.marks is None or not args.reject, "--reject is not for a file of control points")
     known = not args.survey or report(problem, survey.marks).rows
     common.require(bool(known), "--survey needs control points or distances in the file of --constraints")
     if args.strict and len(away := facing_away(problem)):
@@ -427,7 +426,10 @@ def _checked(args: Arguments) -> tuple[str | None, Survey]:
 def _constrained(args: Arguments, path: str | None) -> Survey:
     """A problem with what is constant or measured; without a path the built-in scene."""
     problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
-    return surveyed(problem, args.constant, args.gauge, args.constraints, strict=args.strict, path=path)
+    found = surveyed(problem, args.constant, args.gauge, args.constraints, strict=args.strict, path=path)
+    whole = np.sum(np.asarray(found.problem.point_index) < problem.num_points) == problem.num_observations
+    common.require(bool(whole) or not args.reject, "--reject is for all observations, not for a part")
+    return found
 
 
 def _one_of_several(args: Arguments, path: str) -> BundleProblem:

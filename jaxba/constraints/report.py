@@ -41,7 +41,7 @@ class Report:
 
     def __str__(self) -> str:
         """The report in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
-        lines, checks = [], [row.difference for row in self.rows if row.kind == "check"]
+        lines, checks = [], [row.difference for row in self.rows if row.kind == "check" and row.images]
         for names, lengths in ((("x", "y", "z"), False), (("measured", "found", "less"), True)):
             if mine := [row for row in self.rows if (row.kind == "distance") == lengths]:
                 heads = "".join(f"{one:>11}" for one in names) + "  images  pixels  sigmas"
@@ -92,7 +92,9 @@ def report(problem: BundleProblem, marks: Marks | None) -> Report:
     points = []
     for kinds, names, of, places, stddev in groups:
         found = found_at(problem, of, places, stddev)
-        columns = (places, found.difference, found.whitened, found.images, found.pixels)
+        lost = (np.array(kinds) == "check") & (found.images == 0)  # of which nothing says where they are
+        by, sigmas = np.where(lost[:, None], np.nan, found.difference), np.where(lost, np.nan, found.whitened)
+        columns = (places, by, sigmas, found.images, found.pixels)
         for kind, own, place, by, *more in zip(kinds, names, *(x.tolist() for x in columns), strict=True):
             points.append(Row(kind, own, tuple(place), tuple(by), *more))
     return Report((*points, *lengths))

@@ -550,6 +550,13 @@ def test_the_parser_proposes_the_nearest_option(capsys):
     assert capsys.readouterr().err.endswith("perhaps you meant --policy\n")
 
 
+def test_reject_is_for_all_observations(tmp_path, capsys):
+    write_problem(support.tiny(), f"{tmp_path}/model/")
+    (tmp_path / "c.yaml").write_text("part: {images: [1, 2, 3]}\n")
+    assert run([str(tmp_path / "model"), "--constraints", str(tmp_path / "c.yaml"), "--reject"]) == 2
+    assert capsys.readouterr().err == "error: --reject is for all observations, not for a part\n"
+
+
 def test_reject_notes_wrong_matches_by_image_and_leaves_them_out_of_the_model(tmp_path, capsys):
     scene = random_scene(SceneConfig(cameras=12, points=400, mean_track=6.0, trajectory="orbit"), 1)
     wrong = np.random.default_rng(0).random(scene.num_observations) < 0.2

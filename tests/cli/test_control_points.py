@@ -19,6 +19,9 @@ from jaxba.cli.solve import run
 from jaxba.problem import geometry
 from jaxba.problem.marks import found_at
 
+FILES = ("c.yaml", "log.csv")
+"""What says how to solve a block, besides the control points."""
+
 
 @pytest.fixture(scope="module")
 def block(tmp_path_factory) -> Block:
@@ -42,14 +45,18 @@ def told(file: Path, folder: Path, **more) -> tuple:
     return found.problem, found.marks
 
 
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "survey.csv") as file:
+        return list(csv.DictReader(file))
+
+
 def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def test_check_points_are_as_far_off_as_theory_says(solved):
     """The covariance of the marks is theory's; the RMS of twenty points is within a factor of it."""
-    with open(solved.folder / "survey.csv") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(solved.folder)
     assert [row["kind"] for row in rows] == ["control"] * CONTROLS + ["check"] * CHECKS
     found = np.array([[float(row[axis]) for axis in ("dx", "dy", "dz")] for row in rows])
     problem, _ = told(solved.folder / "c.yaml", solved.folder / "out")
@@ -81,10 +88,9 @@ def test_a_survey_from_python_is_that_of_the_command(solved, tmp_path):
         found = jaxba.survey(jaxba.read_colmap(folder / "model"), constraints, model=folder / "model")
     solution = jaxba.solve(found.problem, "ceres")
     report = found.report(solution)
-    with open(folder / "survey.csv") as file:
-        for row, own in zip(csv.DictReader(file), report.rows, strict=True):
-            assert (row["kind"], row["name"], int(row["images"])) == (own.kind, own.name, own.images)
-            np.testing.assert_allclose([float(row[f"d{axis}"]) for axis in "xyz"], own.difference, atol=1e-6)
+    for row, own in zip(rows_of(folder), report.rows, strict=True):
+        assert (row["kind"], row["name"], int(row["images"])) == (own.kind, own.name, own.images)
+        np.testing.assert_allclose([float(row[f"d{axis}"]) for axis in "xyz"], own.difference, atol=1e-6)
     differences = np.array([row.difference for row in report.rows])[CONTROLS:]
     assert found.marks is not None
     np.testing.assert_array_equal(differences, solution.problem.points[-CHECKS:] - found.marks.places[CONTROLS:])
@@ -190,6 +196,36 @@ def test_positions_give_the_scene_that_they_give_colmap(block, tmp_path):
     np.testing.assert_allclose(found.points, points, atol=1e-3)
     centers = [model.image(int(one)).projection_center() for one in problem.labels.images]
     np.testing.assert_allclose(geometry.camera_centers(found.cameras), centers, atol=1e-3)
+
+
+def test_wrong_matches_and_clicks_are_rejected_and_check_points_are_as_far_off_as_without(solved, tmp_path):
+    """A fifth of the matches is anywhere, a click of a control point is wrong, and one of the two of a check point."""
+    model, rng = jaxba.read_colmap(solved.folder / "model"), np.random.default_rng(1)
+    pixels = np.array(model.observations)
+    edge = np.ceil(np.abs(pixels).max(axis=0))  # which says how large the written images are
+    wrong = (rng.random(len(pixels)) < 0.2) & (np.ceil(np.abs(pixels)) < edge).all(axis=1)
+    pixels[wrong] = rng.uniform(-0.9 * edge, 0.9 * edge, pixels.shape)[wrong]
+    jaxba.write_colmap(model.replace(observations=pixels), tmp_path / "model")
+    lines = [line.split() for line in (solved.folder / "gcp_list.txt").read_text().split("\n")[1:-1]]
+    of = lambda name: [at for at, line in enumerate(lines) if line[6] == name]
+    for at in (of("gcp0")[0], of("gcp5")[0]):
+        lines[at][4] = str(float(lines[at][4]) + 40)  # across the strip, along which the next image is
+    kept = [" ".join(line) for at, line in enumerate(lines) if at not in of("gcp5")[2:]]
+    text = "\n".join(["WGS84 UTM 32N", *kept, ""])
+    for name, content in (("gcp_list.txt", text), *((one, (solved.folder / one).read_text()) for one in FILES)):
+        (tmp_path / name).write_text(content)
+    files = {"--constraints": "c.yaml", "--output": "out", "--survey": "survey.csv"}
+    options = [word for option, name in files.items() for word in (option, str(tmp_path / name))]
+    assert run([str(tmp_path / "model"), *options, "--reject", "--policy", "ceres"]) == 0
+    rows, without = ({row["name"]: row for row in rows_of(folder)} for folder in (tmp_path, solved.folder))
+    assert int(rows["gcp0"]["images"]) == int(without["gcp0"]["images"]) - 1
+    assert (rows["gcp5"]["images"], rows["gcp5"]["dx"]) == ("0", "nan")
+    places = lambda rows: np.array([[float(row[f"d{axis}"]) for axis in "xyz"] for row in rows.values()])[
+        CONTROLS + 1 :
+    ]
+    assert 0.8 < rms(places(rows)) / rms(places(without)) < 1.25
+    after = jaxba.read_colmap(tmp_path / "out")
+    assert after.num_observations < 1.01 * np.sum(~wrong)
 
 
 @pytest.mark.parametrize(
