@@ -110,9 +110,11 @@ def differentiable_solve(
     also depends on its way there, which differences see and derivatives do not.
 
     The problem says everything that the inputs do not: who sees what, lenses, constants, priors, rigs. `policy` and
-    `options` are as for `solve`. Tolerances should be tight: the theorem holds at a minimum. Derivatives of the
-    returned function raise a ProblemError if conjugate gradients do not solve with the Hessian, as where more than
-    gauge and depths of points is not determined; inside `jax.jit` and `jax.vmap` they are NaN then."""
+    `options` are as for `solve`. The scale of the loss is an input as well: a loss of scale one has the same minimum
+    where the whitening of all residuals is divided by the scale. Tolerances should be tight: the theorem holds at a
+    minimum. Derivatives of the returned function raise a ProblemError if conjugate gradients do not solve with the
+    Hessian, as where more than gauge and depths of points is not determined; inside `jax.jit` and `jax.vmap` they are
+    NaN then."""
     check_problem(problem)
     options = checked_options(options)
 

@@ -89,6 +89,27 @@ def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_d
     assert float(found.points[5, 1]) == 0
 
 
+@pytest.mark.slow
+def test_the_scale_of_a_loss_is_an_input_by_what_whitens():
+    """The cost over scale^2, with a loss of scale one, has the same minimum."""
+    problem = constrained()
+    inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
+    ((position, whitening),) = inputs.residuals
+    eye = jnp.tile(jnp.eye(2), (problem.num_observations, 1, 1))
+    options = lambda scale: dataclasses.replace(TIGHT, loss=jaxba.Loss("cauchy", scale))
+    solved = differentiable_solve(problem.replace(whitening=np.array(eye)), "ceres", options(1.0))
+    weights = np.random.default_rng(3).normal(size=problem.cameras.shape) * [1, 1, 1, 1, 1, 1, 1e-3, 1, 1]
+
+    def value(scale) -> jax.Array:
+        scaled = inputs._replace(whitening=eye / scale, residuals=((position, whitening / scale),))
+        return jnp.sum(weights * solved(scaled)[0])
+
+    ends = [
+        np.sum(weights * jaxba.solve(problem, "ceres", options(0.6 + step)).problem.cameras) for step in (1e-3, -1e-3)
+    ]
+    assert float(jax.grad(value)(0.6)) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=5e-3)
+
+
 def small() -> jaxba.BundleProblem:
     """5 cameras and 20 points, all of equal lenses."""
     config = SceneConfig(cameras=5, points=20, mean_track=4.5, trajectory="orbit", max_depth=10.0)
