@@ -10,6 +10,7 @@ import functools
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from jaxba import (
     random_scene,
     scene_like,
 )
+from jaxba.cli.constraints import surveyed
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
 from jaxba.problem.frames import in_frames
@@ -43,6 +45,11 @@ DAMPINGS = (1e-8, 1e-2, 100.0)
 MINIATURES = ("dubrovnik-3-7-pre", "dubrovnik-3-7-18-pre", "dubrovnik-1-1-pre")
 
 _step = jax.jit(lm_step, static_argnames=("options",))
+
+
+def constrained(problem: BundleProblem, *options: Any, **more: Any) -> BundleProblem:
+    """The problem with what `jaxba-solve` holds constant and knows by its options."""
+    return surveyed(problem, *options, **more).problem
 
 
 def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, iteration=0):

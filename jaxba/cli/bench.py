@@ -17,7 +17,6 @@ import tyro
 
 from jaxba.cli import common
 from jaxba.cli.options import options
-from jaxba.problem.checks import counted
 from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "ceres,ceres+refine3,guarded,classic"
@@ -150,7 +149,7 @@ def _run_missing(
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
-        console.print(f"{len(records)} of {counted(len(jobs), 'run')} already in {folder}", soft_wrap=True)
+        console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", soft_wrap=True)
     status = 0
 
     def fail(error: Exception) -> None:
@@ -185,7 +184,7 @@ def _run_missing(
 def _line(problem: str, records: Any) -> str:
     seconds = sum(one.setup_s + one.compile_s + one.total_s for one in records)
     compiled, cost = sum(one.compile_s for one in records), min(one.final_cost for one in records)
-    runs = counted(len(records), "run")
+    runs = common.counted(len(records), "run")
     return f"{problem}: {runs} in {seconds:.1f} s ({compiled:.1f} s of compilation), least cost {cost:.8g}"
 
 

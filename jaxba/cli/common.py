@@ -105,6 +105,11 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
         raise
 
 
+def counted(count: int, noun: str) -> str:
+    """The count with the noun, in the plural unless it is one."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def print_error(message: str) -> int:
     """Prints an error as one line to stderr and returns the exit status for invalid input."""
     print(f"error: {message}", file=sys.stderr)

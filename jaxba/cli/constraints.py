@@ -6,21 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 from jaxba.cli.common import UsageError
-from jaxba.constraints import file as settings
-from jaxba.constraints.file import ConstraintError, Survey
+from jaxba.constraints.file import ConstraintError, Survey, constrained
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.gauge import Gauge, with_gauge
 from jaxba.problem.hold import hold
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
 """What `--constant` names besides numbers of lenses."""
-
-
-def constrained(
-    problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None, *, strict: bool = False
-) -> BundleProblem:
-    """`surveyed` of a problem without a file of control points."""
-    return surveyed(problem, constant, gauge, file, strict=strict).problem
 
 
 def surveyed(
@@ -38,7 +30,7 @@ def surveyed(
     functions of `jaxba` that do it."""
     held = lambda one: _held(one, constant)
     try:
-        found, in_file = settings.constrained(problem, file or {}, model=path, strict=strict, held=held)
+        found, in_file = constrained(problem, file or {}, model=path, strict=strict, held=held)
     except ConstraintError as error:
         raise UsageError(f"--constraints {error}") from None
     return replace(found, problem=with_gauge(found.problem, gauge or in_file))

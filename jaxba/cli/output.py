@@ -54,8 +54,8 @@ def check_outputs(
         common.check_writable(option, path)
     written = {option: [path] for option, path in others.items()}
     check_apart({"--output": solution, **written}, {what: [path] for what, path in read.items()})
-    replaced = output and source and os.path.exists(output) and os.path.samefile(output, source)
-    replaced = replaced and not _is_transforms(str(output), source)  # which are cameras alone
+    same = output and source and os.path.exists(output) and os.path.samefile(output, source)
+    replaced = same and not _is_transforms(str(output), source)  # which are cameras alone
     check_apart({"--output": [] if replaced else solution, **written}, {PROBLEM: problem_files(source)})
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from jaxba.cli import common
 from jaxba.cli.options import options
-from jaxba.problem.checks import counted
 
 FULL, FAST = "full", "fast"
 """Names of the presets."""
@@ -124,7 +123,7 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
                 started, before = time.perf_counter(), runner.done
                 entry.run(runner)
                 spent = time.perf_counter() - started
-                console.print(f"  {counted(runner.done - before, 'run')}, {spent:.1f} s")
+                console.print(f"  {common.counted(runner.done - before, 'run')}, {spent:.1f} s")
         except KeyboardInterrupt:
             console.print("interrupted; what is done is kept, run the same command again to continue")
             status = common.INTERRUPTED

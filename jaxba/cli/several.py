@@ -19,7 +19,6 @@ from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import formats, is_colmap
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.checks import counted
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
 from jaxba.solver.many import Result, solve_many
@@ -119,7 +118,7 @@ def solve_all(
     failed = len(rows) - len(solved)
     total = lambda name: sum(float(getattr(row, name)) for row in solved)
     common.print_line(
-        f"{counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
+        f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
         f"cost {total('initial_cost'):.6g} -> {total('final_cost'):.6g} in all, "
         f"{total('iterations') / max(1, len(solved)):.1f} iterations each"
     )

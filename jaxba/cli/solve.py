@@ -30,7 +30,6 @@ from jaxba.io import is_colmap, read_colmap, read_problem
 from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.checks import counted
 from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.gauge import Gauge
 from jaxba.problem.hold import hold
@@ -413,8 +412,8 @@ def _checked(args: Arguments) -> tuple[str | None, Survey]:
     with common.notes_printed():
         survey = _constrained(args, path)
     problem = survey.problem
-    known = not args.survey or report(problem, survey.marks).rows
-    common.require(bool(known), "--survey needs control points or distances in the file of --constraints")
+    known = not args.survey or bool(report(problem, survey.marks).rows)
+    common.require(known, "--survey needs control points or distances in the file of --constraints")
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
@@ -493,7 +492,7 @@ def _by_recipes(
     with common.notes_printed():
         found = solve_recipes(problem, args.recipes or 1, policy, options)
     for name, one in zip((args.policy, *RECIPES[1:]), found, strict=False):
-        common.print_line(f"{name}: cost {one.final_cost:.6e} after {counted(one.iterations, 'iteration')}")
+        common.print_line(f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}")
     return min(found, key=lambda one: one.final_cost), []
 
 

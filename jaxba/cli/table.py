@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxba.cli.common import counted
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.checks import counted
 from jaxba.problem.facing import NAMED, views_behind, without_views_of
 from jaxba.problem.labels import part_name, part_names
 from jaxba.problem.losses import Loss

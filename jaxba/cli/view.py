@@ -17,7 +17,6 @@ import tyro
 from jaxba.cli import common
 from jaxba.cli.options import options
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.checks import counted
 from jaxba.solver.drivers import IterationRecord, Watch
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def _run(args: Arguments) -> int:
     viewer = Viewer(shown, args.host)
     announce(viewer)
     if missing := viewer.load_images():
-        common.print_line(f"note: {counted(missing, 'image')} not found in {args.images}")
+        common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
     wait(viewer)
     return 0
 

@@ -45,6 +45,10 @@ OF_PART = {"images": "image", "points": "point", "ignored": "point", "min_track"
 """Keys of `part`, and of what kind the items of their lists are; None for a number."""
 
 
+Constraints = StrPath | Mapping[str, Any]
+"""A YAML file, or a mapping with its keys."""
+
+
 class ConstraintError(ProblemError):
     """Constraints that cannot be used. The message is one line that begins with their file and key."""
 
@@ -74,11 +78,7 @@ class Survey(ArrayRecord):
 
 
 def survey(
-    problem: BundleProblem,
-    constraints: StrPath | Mapping[str, Any],
-    *,
-    model: StrPath | None = None,
-    strict: bool = False,
+    problem: BundleProblem, constraints: Constraints, *, model: StrPath | None = None, strict: bool = False
 ) -> Survey:
     """The problem with what a survey and other constraints say of it, as `jaxba-solve --constraints` has them.
 
@@ -89,15 +89,14 @@ def survey(
         model: the COLMAP model that the problem was read from, which a file of control points needs.
         strict: refuse what is not in the problem, instead of leaving it out with a `ProblemWarning`.
 
-    Raises ProblemError: something is not in the problem, or not what the key takes; one line that names file and key.
-    """
+    Raises ProblemError: something is not in the problem, or not what its key takes; one line with file and key."""
     found, gauge = constrained(problem, constraints, model=model, strict=strict)
     return replace(found, problem=with_gauge(found.problem, gauge))
 
 
 def constrained(
     problem: BundleProblem,
-    constraints: StrPath | Mapping[str, Any],
+    constraints: Constraints,
     *,
     model: StrPath | None,
     strict: bool,

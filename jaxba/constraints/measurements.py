@@ -12,17 +12,17 @@ from jaxba import residuals
 from jaxba.constraints import values
 from jaxba.io.files import reason
 from jaxba.io.notes import report
+from jaxba.io.positions import read_gravity
 from jaxba.model.registration import with_residual
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.checks import counted
 from jaxba.problem.hold import every_lens
 from jaxba.problem.labels import Part
 
 MEASURED = {
     "control_points": "positions: {id: [x, y, z]}, or file, check, pixels, crs and align; stddev, loss and loss_scale",
     "distances": "a list of {points: [id, id], length, stddev}",
-    "gravity": "up, directions: {name or id: [x, y, z]}, stddev, loss and loss_scale",
+    "gravity": "up, directions: {name or id: [x, y, z]}, or database; stddev, loss and loss_scale",
     "relative_poses": "a list of {images: [name or id, name or id], rotation, translation, stddev}",
     "depths": "folder, stddev, loss and loss_scale",
 }
@@ -44,6 +44,10 @@ def with_measured(problem: BundleProblem, where: str, key: str, value: Any, stri
         items, columns = values.parse_pairs(value, kind, shapes)
     else:
         what = "directions" if key == "gravity" else "positions"
+        if key == "gravity" and isinstance(value, dict) and "database" in value and what not in value:
+            found = read_gravity(values.beside(where, value, "database"))
+            value = {name: one for name, one in value.items() if name != "database"}
+            value[what] = {name: list(map(str, up.tolist())) for name, up in found.items()}
         items, columns = values.parse_vectors(value, what, kind, ["up"] if key == "gravity" else [])
         loss = values.parse_loss(value)
     at, kept = parts_of(problem, where, kind, items, what, strict)
@@ -83,14 +87,16 @@ def parts_of(
     kept, others = np.flatnonzero(known.all(axis=1)), list(dict.fromkeys(np.array(items)[~known]))
     if not len(kept):
         raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others)}")
-    leave_out(where, f"{what} of {counted(len(others), kind)} that the problem does not have", others, strict)
+    leave_out(where, kind, f"{what} of {{}} that the problem does not have", others, strict)
     flat = wanted[kept].T.ravel()
     at = flat.astype(int) if labels is None else labels.positions(kind, flat)
     return at.reshape(-1, len(kept)), kept
 
 
-def leave_out(where: str, what: str, names: list[str], strict: bool) -> None:
-    """Notes what is left out, if it is anything. Raises ValueError: `strict`; one line."""
+def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool) -> None:
+    """Notes what is left out, if it is anything: `what`, with the number of what is called `noun`. Raises ValueError:
+    `strict`; one line."""
+    what = what.format(f"{len(names)} {noun}{'s' * (len(names) != 1)}")
     if names and strict:
         raise ValueError(f"{what}: {values.names_of(names)}")
     report([f"{where}: left out {what}: {values.names_of(names)}"] if names else [])
@@ -101,9 +107,7 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
 
     Of a BAL lens, whose pixels do not say where the image is, the principal point is the middle of the map."""
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
-    if not isinstance(value["folder"], str):
-        raise ValueError(f"folder: must be a name, not {value['folder']}")
-    folder, loss = Path(where.rpartition(": ")[0]).parent / value["folder"], values.parse_loss(value)
+    folder, loss = values.beside(where, value, "folder"), values.parse_loss(value)
     if not folder.is_dir():
         raise ValueError(f"folder: there is no folder {folder}")
     relative = values.parse_deviations("stddev", value["stddev"])[0]
@@ -112,7 +116,7 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
         next((x for x in (folder / f"{n}.npy", (folder / n).with_suffix(".npy")) if x.is_file()), None) for n in names
     ]
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
-    leave_out(where, f"{counted(len(missing), 'image')} without a map", missing, strict)
+    leave_out(where, "image", "{} without a map", missing, strict)
     camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)
     for at, file in enumerate(files):
         if file is not None:

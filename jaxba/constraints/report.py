@@ -92,8 +92,8 @@ def report(problem: BundleProblem, marks: Marks | None) -> Report:
     points = []
     for kinds, names, of, places, stddev in groups:
         found = found_at(problem, of, places, stddev)
-        lost = (np.array(kinds) == "check") & (found.images == 0)  # of which nothing says where they are
-        by, sigmas = np.where(lost[:, None], np.nan, found.difference), np.where(lost, np.nan, found.whitened)
+        known = np.where((np.array(kinds) == "check") & (found.images == 0), np.nan, 1)  # what says where they are
+        by, sigmas = found.difference * known[:, None], found.whitened * known
         columns = (places, by, sigmas, found.images, found.pixels)
         for kind, own, place, by, *more in zip(kinds, names, *(x.tolist() for x in columns), strict=True):
             points.append(Row(kind, own, tuple(place), tuple(by), *more))

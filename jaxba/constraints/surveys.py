@@ -20,7 +20,6 @@ from jaxba.io.positions import Positions, read_database, read_photos, read_table
 from jaxba.model.registration import with_residual
 from jaxba.problem.alignment import alignment
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.checks import counted
 from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.hold import every_lens
 from jaxba.problem.losses import Loss
@@ -76,7 +75,7 @@ def with_control_points(
     sigma = float(values.parse_numbers("pixels", value.get("pixels", "1"), "a positive number", ()))
     if sigma <= 0:
         raise ValueError(f"pixels: must be a positive number, not {sigma:g}")
-    given = read_control_points(_beside(where, value, "file"))
+    given = read_control_points(values.beside(where, value, "file"))
     stddev = values.parse_stddev(value, given.names, "point")
     checks = values.parse_items(value.get("check", []), "names")
     if unknown := [name for name in checks if name not in given.names]:
@@ -88,7 +87,7 @@ def with_control_points(
     few = [name for name, count in zip(given.names, images, strict=True) if count < 2]
     if not len(used):
         raise ValueError("no point is in two images of the problem")
-    leave_out(where, f"{counted(len(few), 'point')} in fewer than two images of the problem", few, strict)
+    leave_out(where, "point", "{} in fewer than two images of the problem", few, strict)
     places, crs = given.places[used], _crs(value) or given.crs
     if crs and frame is None and problem.residuals:
         raise ValueError("the points have a crs, and position_priors have none")
@@ -132,23 +131,12 @@ def _full_names(problem: BundleProblem, names: list[str]) -> list[str]:
     return [full.get(name) or full.get(Path(name).name, name) for name in names]
 
 
-def _beside(where: str, value: dict[str, Any], key: str) -> Path:
-    """The path that a key says, beside the file with which `where` begins."""
-    return Path(where.rpartition(": ")[0]).parent / _word(value, key)
-
-
 def _crs(value: dict[str, Any]) -> str:
-    return _word(value, "crs") if "crs" in value else ""
-
-
-def _word(value: dict[str, Any], key: str) -> str:
-    if not isinstance(value[key], str) or not value[key]:
-        raise ValueError(f"{key}: must be a name, not {value[key]}")
-    return value[key]
+    return values.parse_word(value, "crs") if "crs" in value else ""
 
 
 def _read(problem: BundleProblem, where: str, source: str, value: Any, strict: bool) -> Positions:
-    path = _beside(where, value, source)
+    path = values.beside(where, value, source)
     if source != "photos":
         of_file = read_transforms if path.suffix == ".json" else read_table
         return (of_file if source == "file" else read_database)(path)
@@ -156,5 +144,5 @@ def _read(problem: BundleProblem, where: str, source: str, value: Any, strict: b
         raise ValueError("photos: the problem does not name its images")
     found = read_photos(path, names := problem.labels.names)
     others = sorted({*names} - {*found.names})
-    leave_out(where, f"{counted(len(others), 'photo')} without a position", others, strict)
+    leave_out(where, "photo", "{} without a position", others, strict)
     return found

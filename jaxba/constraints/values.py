@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,6 +140,17 @@ def parse_numbers(where: str, value: Any, what: str, *shapes: tuple[int, ...]) -
     if numbers.shape not in shapes or not np.isfinite(numbers).all():
         raise ValueError(f"{where}: must be {what}, not {_written(value)}")
     return numbers
+
+
+def parse_word(value: dict[str, Any], key: str) -> str:
+    if not isinstance(value[key], str) or not value[key]:
+        raise ValueError(f"{key}: must be a name, not {_written(value[key])}")
+    return value[key]
+
+
+def beside(where: str, value: dict[str, Any], key: str) -> Path:
+    """The path that a key says, beside the file with which `where` begins."""
+    return Path(where.rpartition(": ")[0]).parent / parse_word(value, key)
 
 
 def parse_truth(where: str, value: Any) -> bool:

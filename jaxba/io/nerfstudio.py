@@ -40,7 +40,6 @@ def write_transforms(problem: BundleProblem, path: StrPath, like: StrPath | None
     images without observations the file gets; None: they are made up as by `write_colmap`. Raises ProblemError: as
     `write_colmap`, or a camera model that nerfstudio does not have."""
     target = display_name(path)
-    check_transforms(problem, path)
     model = create_model(problem, target) if like is None else with_problem(read_model(like), problem, target)[0]
     images = registered(model)[0]
     lenses = {camera: _lens(model.cameras[camera]) for camera in sorted({image.camera for image in images})}
@@ -78,7 +77,6 @@ def _kind(models: Iterable[str], target: str) -> str:
 def _lens(camera: Camera) -> dict[str, Any]:
     """A camera in nerfstudio's words."""
     numbers = dict(zip(CAMERA_MODELS[camera.model].parameters, camera.params, strict=True))
-    fx, fy = camera.focals[0], camera.focals[-1]
     bent = {name: value for name, value in numbers.items() if name[0] in "kp"}
-    size = {"w": camera.width, "h": camera.height}
-    return {"fl_x": fx, "fl_y": fy, "cx": numbers["cx"], "cy": numbers["cy"], **size, "k1": 0.0, "k2": 0.0, **bent}
+    size = {"w": camera.width, "h": camera.height, "cx": numbers["cx"], "cy": numbers["cy"]}
+    return {"fl_x": camera.focals[0], "fl_y": camera.focals[-1], **size, "k1": 0.0, "k2": 0.0, **bent}

@@ -106,30 +106,44 @@ def _named(cells: Sequence[str]) -> dict[str, int]:
 def read_database(path: StrPath) -> Positions:
     """Reads the positions of COLMAP's database. Source: COLMAP 4.2, `pose_priors` in database_sqlite.cc; before 4.0 the
     table has the image instead of sensor and data. Raises ProblemError: it is none, or has no positions; one line."""
-    file = display_name(path)
-    try:
-        with closing(sqlite3.connect(f"{Path(path).resolve().as_uri()}?mode=ro", uri=True)) as base:
-            columns = [row[1] for row in base.execute("PRAGMA table_info(pose_priors)")]
-            image, of_camera = (
-                ("image_id", "") if "image_id" in columns else ("corr_data_id", "AND corr_sensor_type = 0")
-            )
-            covariance = "position_covariance" if "position_covariance" in columns else "NULL"
-            rows = base.execute(
-                f"SELECT name, position, {covariance}, coordinate_system FROM pose_priors JOIN images "
-                f"ON images.image_id = pose_priors.{image} {of_camera} ORDER BY images.image_id"
-            ).fetchall()
-    except sqlite3.Error as error:
-        raise ProblemError(f"{file}: is no database of COLMAP with positions: {reason(error)}") from None
-    numbers = lambda blob, count: np.frombuffer(blob) if blob and len(blob) == 8 * count else np.full(count, np.nan)
-    places = np.array([numbers(row[1], 3) for row in rows]).reshape(-1, 3)
+    file, rows = display_name(path), _pose_priors(path, "position", "position_covariance", "coordinate_system")
+    places = np.array([_numbers(row[1], 3) for row in rows]).reshape(-1, 3)
     kept = np.flatnonzero(np.isfinite(places).all(axis=1))
     systems = {rows[at][3] for at in kept}
     if len(systems) != 1:
         raise ProblemError(f"{file}: has {'positions of different coordinate systems' if systems else 'no positions'}")
-    covariances = np.array([numbers(rows[at][2], 9) for at in kept]).reshape(-1, 3, 3)
+    covariances = np.array([_numbers(rows[at][2], 9) for at in kept]).reshape(-1, 3, 3)
     known, geographic = np.isfinite(covariances).all(), systems == {0}
     places = places[kept][:, [1, 0, 2]] if geographic else places[kept]
     return Positions([rows[at][0] for at in kept], places, covariances if known else None, WGS84 if geographic else "")
+
+
+def read_gravity(path: StrPath) -> dict[str, Float[np.ndarray, "3"]]:
+    """Reads where up is in images of COLMAP's database, by name, in COLMAP's axes of the camera: the opposite of its
+    gravity, which points down. Source: COLMAP 4.2, `SynthesizeDataset`. Raises ProblemError: as `read_database`."""
+    priors = [(name, -_numbers(blob, 3)) for name, blob in _pose_priors(path, "gravity")]
+    if not (found := {name: up for name, up in priors if np.isfinite(up).all()}):
+        raise ProblemError(f"{display_name(path)}: has no directions of gravity")
+    return found
+
+
+def _pose_priors(path: StrPath, *wanted: str) -> list[Any]:
+    """Names of images with columns of their priors, which are None where the table does not have them."""
+    try:
+        with closing(sqlite3.connect(f"{Path(path).resolve().as_uri()}?mode=ro", uri=True)) as base:
+            columns = [row[1] for row in base.execute("PRAGMA table_info(pose_priors)")]
+            image, own = ("image_id", "") if "image_id" in columns else ("corr_data_id", "AND corr_sensor_type = 0")
+            names = ", ".join(one if one in columns else "NULL" for one in wanted)
+            return base.execute(
+                f"SELECT name, {names} FROM pose_priors JOIN images "
+                f"ON images.image_id = pose_priors.{image} {own} ORDER BY images.image_id"
+            ).fetchall()
+    except sqlite3.Error as error:
+        raise ProblemError(f"{display_name(path)}: is no database of COLMAP with positions: {reason(error)}") from None
+
+
+def _numbers(blob: bytes | None, count: int) -> Float[np.ndarray, " count"]:
+    return np.frombuffer(blob) if blob and len(blob) == 8 * count else np.full(count, np.nan)
 
 
 def read_transforms(path: StrPath) -> Positions:

@@ -19,11 +19,6 @@ def shown(value: Any, longest: int = SHOWN) -> str:
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
-def counted(count: int, noun: str) -> str:
-    """The count with the noun, in the plural unless it is one."""
-    return f"{count} {noun}{'s' * (count != 1)}"
-
-
 def plain_array(name: str, values: Any) -> np.ndarray:
     """A NumPy array. Raises ValueError: rows differ in length, or masked entries. Raises TypeError: JAX traces them."""
     if np.ma.is_masked(values):

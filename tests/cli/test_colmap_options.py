@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import support
+from support import constrained
 
 from jaxba import BundleProblem, ProblemWarning, hold, read_problem, with_gauge, write_colmap
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.common import UsageError
-from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
 
 POSITIONS = "position_priors: {positions: {1: [0, 0, 0], 2: [1, 0, 0], 3: [0, 1, 0], 4: [0, 0, 1]}"
@@ -212,8 +212,9 @@ def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
 
 
 def test_positions_of_other_images_are_left_out_with_a_note(model, tmp_path):
+    from support import constrained
+
     from jaxba.cli.common import UsageError
-    from jaxba.cli.constraints import constrained
     from jaxba.problem import geometry
 
     problem, file = read_problem(model), tmp_path / "log.yaml"

@@ -11,12 +11,13 @@ import pyproj
 import pytest
 import support
 from PIL import Image
+from support import constrained
 
 import jaxba
-from jaxba import ProblemWarning
+from jaxba import ProblemError, ProblemWarning
 from jaxba.cli.common import UsageError
-from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
+from jaxba.model.registration import costs_by_kind
 from jaxba.problem import geometry
 from jaxba.problem.labels import Labels
 from jaxba.problem.similarity import Similarity, transformed
@@ -166,3 +167,29 @@ def test_mistakes_are_one_line_that_names_the_key(text, message, scene, tmp_path
         constrained(scene[1], (), None, str(tmp_path / "c.yaml"))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("down", [(0.0, 1.0, 0.0), (0.6, 0.0, -0.8)])
+def test_gravity_of_colmaps_database_is_down_in_the_images(down, tmp_path):
+    """COLMAP makes rigs of two cameras, with and without gravity; its own poses have no residual."""
+    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
+    options = {"num_rigs": 1, "num_cameras_per_rig": 2, "prior_gravity": True, "prior_gravity_in_world": down}
+    with pycolmap.Database.open(tmp_path / "d.db") as base:
+        made = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(**options), base)
+        (first, *_) = base.read_all_pose_priors()
+        first.gravity = np.full(3, np.nan)
+        base.update_pose_prior(first)
+    problem = jaxba.from_pycolmap(made)
+    constraints = {"database": tmp_path / "d.db", "stddev": 0.02}
+    surveyed = lambda up: jaxba.survey(problem, {"gravity": {"up": up, **constraints}}).problem
+    found = surveyed(-np.array(down))
+    (rows,) = found.residuals.rows
+    assert len(rows) == problem.num_cameras - 1
+    assert costs_by_kind(found)["gravity"] < 1e-20
+    assert costs_by_kind(surveyed(down))["gravity"] == pytest.approx(len(rows) * 0.5 * (2 / 0.02) ** 2)
+    with pytest.raises(ProblemError, match=r"gravity: .*no\.db: is no database of COLMAP"):
+        jaxba.survey(problem, {"gravity": {"up": down, "database": tmp_path / "no.db"}})
+    write_database(tmp_path / "old.db", problem, np.zeros((problem.num_cameras, 3)))
+    with pytest.raises(ProblemError, match=r"gravity: .*old\.db: has no directions of gravity"):
+        jaxba.survey(problem, {"gravity": {"up": down, "database": tmp_path / "old.db"}})

@@ -15,7 +15,7 @@ from typing import IO
 import numpy as np
 import pytest
 import support
-from support import DATA, needs_data
+from support import DATA, constrained, needs_data
 
 from jaxba import (
     BundleProblem,
@@ -31,7 +31,6 @@ from jaxba import (
 )
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run as run_bench
-from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
 from jaxba.io import json_lines
 from jaxba.io.colmap.lenses import AS_BAL

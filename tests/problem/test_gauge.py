@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import constrained
 
 from jaxba import (
     BundleProblem,
@@ -23,7 +24,6 @@ from jaxba import (
     with_position_priors,
     write_colmap,
 )
-from jaxba.cli.constraints import constrained
 from jaxba.problem import geometry
 from jaxba.problem.frames import num_unknowns
 

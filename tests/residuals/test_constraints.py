@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import constrained
 
 import jaxba
 from jaxba import ProblemWarning, residuals
 from jaxba.cli.common import UsageError
-from jaxba.cli.constraints import constrained
 from jaxba.problem import geometry
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.labels import Labels

@@ -75,8 +75,7 @@ def with_problem(model: Model, problem: BundleProblem, target: str) -> tuple[Mod
     `target` is what messages say is written. Raises ProblemError: another model's problem, or unstorable."""
     bal = problem.lenses is None or problem.lenses.all_bal
     assembled = assemble(model, refine_principal_point=not bal)
-    old = assembled.problem
-    if (problem.num_cameras, problem.num_points) != (old.num_cameras, old.num_points):
+    if (problem.num_cameras, problem.num_points) != (len(assembled.images), len(assembled.points)):
         raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(model.folder)}")
     _check_finite(model, assembled, problem, target)
     model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
