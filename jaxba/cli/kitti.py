@@ -23,7 +23,6 @@ from jaxba.io.formats import FORMATS, by_ending
 from jaxba.io.frames import poses_of, read_poses, read_sidecar, write_sidecar
 from jaxba.io.notes import note, note_center
 from jaxba.kitti import evaluate
-from jaxba.kitti.assemble import Frames, windows
 from jaxba.kitti.evaluate import path_length
 from jaxba.kitti.options import Build
 from jaxba.kitti.sequence import calibration_files, read_sequence
@@ -59,12 +58,6 @@ class Files:
     calibration: Annotated[str | None, "FILE"] = None
     """Camera matrix: lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers. Default: that of
     the sequence."""
-
-    window: int | None = None
-    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
-
-    stride: int | None = None
-    """Key-frames from the start of one window to the next. Default: half a window."""
 
 
 @options
@@ -115,7 +108,6 @@ def _check(args: Arguments) -> None:
     common.require(args.min_views >= 2, f"--min-views must be at least 2, is {args.min_views}")
     common.require(0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
     common.require(args.start == "vo" or args.poses is not None, "--start poses needs --poses")
-    common.require(args.stride is None or args.window is not None, "--stride needs --window")
     common.check_writable("--out", args.out)
     check_output(args.out)
     is_bal = by_ending(args.out) in (None, FORMATS[0])
@@ -130,21 +122,18 @@ def _build(args: Arguments) -> int:
     console = common.console()
     with common.notes_printed(), _progress(console) as report:
         sequence, poses = _inputs(args)
-        _check_apart([args.out], sequence, args)
-        whole, frames, tracks = build(sequence, args, poses, report)
-    parts = _parts(whole, frames, args)
-    _check_apart([path for _, _, path in parts], sequence, args)
-    for part in parts:
-        _write(*part, sequence, args)
+        _check_apart(sequence, args)
+        problem, frames, tracks = build(sequence, args, poses, report)
+    _write(problem, frames, sequence, args)
     title = f"{len(sequence)} frames, {len(frames)} key-frames, {tracks} tracks"
-    console.print(_build_table(title, parts, poses))
-    console.print(f"wrote {', '.join(path for _, _, path in parts)}")
+    console.print(_build_table(title, problem, frames, poses))
+    console.print(f"wrote {args.out}")
     return 0
 
 
-def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> None:
-    """Refuses a problem, or the frames beside one, in the place of a file of the sequence."""
-    written = {"--out": [*problems, *map(sidecar_path, problems)]}
+def _check_apart(sequence: Any, args: Arguments) -> None:
+    """Refuses a problem, or the frames beside it, in the place of a file of the sequence."""
+    written = {"--out": [args.out, sidecar_path(args.out)]}
     folder = Path(args.sequence)
     own = [*sequence.images, *calibration_files(folder), folder / "times.txt"]
     read = {"the file of --poses": [args.poses], "the file of --calibration": [args.calibration]}
@@ -170,18 +159,7 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     return sequence, poses
 
 
-def _parts(whole: BundleProblem, frames: Frames, args: Arguments) -> list[tuple[BundleProblem, Frames, str]]:
-    """The problems to write, the frames of their cameras, and their files."""
-    if args.window is None:
-        return [(whole, frames, args.out)]
-    stride = max(args.window // 2, 1) if args.stride is None else args.stride
-    plain = strip_compression(args.out)
-    stem, ending = Path(plain).with_suffix(""), Path(plain).suffix + args.out[len(plain) :]
-    parts = windows(whole, frames, args.window, stride, args.min_views)
-    return [(part, own, f"{stem}-{own[0]:06d}-{own[-1]:06d}{ending}") for part, own in parts]
-
-
-def _write(problem: BundleProblem, frames: Frames, path: str, sequence: Any, args: Arguments) -> None:
+def _write(problem: BundleProblem, frames: tuple[int, ...], sequence: Any, args: Arguments) -> None:
     """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
     from jaxba import __version__
     from jaxba.kitti.opencv import cv2
@@ -193,23 +171,20 @@ def _write(problem: BundleProblem, frames: Frames, path: str, sequence: Any, arg
         "options": asdict(args),
         "versions": {"jaxba": __version__, "opencv": cv2.__version__},
     }
-    write_sidecar(path, metadata)
-    write_problem(problem, path)
+    write_sidecar(args.out, metadata)
+    write_problem(problem, args.out)
 
 
-def _build_table(title: str, parts: list[tuple[BundleProblem, Frames, str]], poses: Any) -> Any:
+def _build_table(title: str, problem: BundleProblem, frames: tuple[int, ...], poses: Any) -> Any:
     table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
-    for problem, frames, _ in parts:
-        error = np.linalg.norm(geometry.residuals(problem), axis=1).mean()
-        ate = "-"
-        if poses is not None:
-            try:
-                found = evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))
-                ate = f"{found['ate_m']['rmse']:.3f}"
-            except ProblemError:  # a straight line, or two cameras
-                ate = "undefined"
-        numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
-        table.add_row(f"{frames[0]} to {frames[-1]}", *map(str, numbers))
+    error, ate = np.linalg.norm(geometry.residuals(problem), axis=1).mean(), "-"
+    if poses is not None:
+        try:
+            ate = f"{evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))['ate_m']['rmse']:.3f}"
+        except ProblemError:  # a straight line, or two cameras
+            ate = "undefined"
+    numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
+    table.add_row(f"{frames[0]} to {frames[-1]}", *map(str, numbers))
     return table
 
 

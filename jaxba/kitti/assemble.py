@@ -44,25 +44,3 @@ def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Fra
     cameras[:, 6] = calibration.fx
     pixels = calibration.fx * rays[keep] * [1, -1]
     return BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
-
-
-def windows(
-    problem: BundleProblem, frames: Frames, size: int, stride: int, min_views: int
-) -> list[tuple[BundleProblem, Frames]]:
-    """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before, and their frames.
-
-    The last one ends with the last camera, so it may start less than `stride` after the one before. A window keeps the
-    points that its cameras see `min_views` times. Raises ProblemError: the size or stride is out of range."""
-    cameras = problem.num_cameras
-    if not 2 <= size <= cameras:
-        raise ProblemError(f"--window must lie between 2 and the {cameras} key-frames, is {size}")
-    if stride < 1:
-        raise ProblemError(f"--stride must be positive, is {stride}")
-    camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
-    found = []
-    for first in (*range(0, cameras - size, stride), cameras - size):
-        keep = (camera_index >= first) & (camera_index < first + size)
-        keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
-        part = problem.subset(keep, np.arange(first, first + size), np.unique(point_index[keep]))
-        found.append((part, frames[first : first + size]))
-    return found

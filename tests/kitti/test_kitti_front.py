@@ -179,16 +179,6 @@ def test_given_poses_are_the_start(rendered, tmp_path, capsys):
     assert "ate_m" not in json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"][0]
 
 
-def test_windows_are_problems_of_their_own(rendered, tmp_path):
-    out = tmp_path / "p.txt.gz"
-    assert build(rendered[SMALL], out, "--window", "6", "--stride", "4", "--keyframes", "all") == 0
-    names = sorted(p.name for p in tmp_path.iterdir() if p.name.endswith(".gz"))
-    assert names == [f"p-{a:06d}-{a + 5:06d}.txt.gz" for a in (0, 4, 8)]
-    for name in names:
-        assert read_bal(tmp_path / name).num_cameras == 6
-        assert len(json.loads((tmp_path / name.replace("txt.gz", "frames.json")).read_text())["frames"]) == 6
-
-
 # Sequences with trouble
 
 
@@ -300,7 +290,6 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
     ("options", "words"),
     [
         (["--start", "poses"], "--start poses needs --poses"),
-        (["--stride", "3"], "--stride needs --window"),
         (["--keypoints", "0"], "--keypoints must be positive"),
         (["--min-views", "1"], "--min-views must be at least 2"),
         (["--out", "p.ply"], "the problem is a BAL file"),
@@ -311,10 +300,6 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (["--poses", "nowhere.txt"], "cannot read nowhere.txt"),
         (["--keyframes", "few", "--frames", "0:3"], "--keyframes must be"),
         (["--min-matches", "3000", "--frames", "0:3"], "at least 3000 are needed"),
-        (
-            ["--window", "99", "--frames", "0:5", "--keyframes", "all"],
-            "--window must lie between 2 and the 5 key-frames",
-        ),
     ],
 )
 def test_what_makes_no_sense_is_said_in_one_line(rendered, tmp_path, monkeypatch, capsys, options, words):

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxba.io.frames import Calibration
-from jaxba.kitti.assemble import assemble, windows
+from jaxba.kitti.assemble import assemble
 from jaxba.kitti.odometry import visual_odometry
 from jaxba.kitti.options import Build
 from jaxba.kitti.tracks import Tracks, choose, join_matches, make_tracks, parallax
@@ -325,19 +325,3 @@ def test_a_frame_without_points_is_named():
     lonely = tracks.keep((tracks.image != 4) | (tracks.track < 9))
     with pytest.raises(ProblemError, match="frame 40 sees 9 good ones, at least 10"):
         assemble(lonely, views, CALIBRATION, (0, 10, 20, 30, 40, 50), NEARLY_ALL)
-
-
-def test_windows_cover_all_cameras_and_keep_residuals():
-    _, views, points = street(views=9)
-    frames = tuple(range(0, 18, 2))
-    whole = assemble(as_tracks(sight(views, points)), views, CALIBRATION, frames, Build())
-    parts = windows(whole, frames, 4, 3, 2)
-    assert [own for _, own in parts] == [(0, 2, 4, 6), (6, 8, 10, 12), (10, 12, 14, 16)]
-    for part, _ in parts:
-        assert part.num_cameras == 4
-        np.testing.assert_allclose(geometry.residuals(part), 0, atol=1e-6)
-    assert len(windows(whole, frames, 9, 1, 2)) == 1
-    assert [own[0] for _, own in windows(whole, frames, 3, 3, 2)] == [0, 6, 12]
-    for size, stride, words in ((1, 1, "--window"), (10, 1, "--window"), (4, 0, "--stride")):
-        with pytest.raises(ProblemError, match=words):
-            windows(whole, frames, size, stride, 2)
