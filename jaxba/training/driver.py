@@ -1,8 +1,8 @@
 """The training driver: compiled chunks, evaluations between them, checkpoints, and bitwise identical resuming.
 
-A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `checkpoints/`. A checkpoint holds the loop's
-state, the best policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that
-can be read, removes from the log what was written after it, and repeats that, with the same numbers.
+A run has a folder with `config.yaml`, `metrics.jsonl` and `checkpoints/`. A checkpoint holds the loop's state, the best
+policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that can be read,
+removes from the log what was written after it, and repeats that, with the same numbers.
 
 All agents of a run are trained side by side, in one program over an axis of agents."""
 
@@ -23,10 +23,10 @@ from jaxba import settings
 from jaxba.io.files import visible
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.numerics import for_traces
-from jaxba.training import checkpoint
+from jaxba.training import checkpoint, log
 from jaxba.training.checkpoint import TrainError
 from jaxba.training.config import TrainConfig, load
-from jaxba.training.log import Log, Row
+from jaxba.training.log import Row
 from jaxba.training.train_loop import LoopState, run_agents, start_agents
 
 CONFIG = "config.yaml"
@@ -147,11 +147,7 @@ def train(
 
     Raises:
         TrainError: losses or all transitions are not finite, or no checkpoint can be used or written."""
-    run = _Run(config, env, evaluate, folder, hooks or Hooks(), loop or begin_compiling(config, env))
-    try:
-        return run.finish()
-    finally:
-        run.log.close()
+    return _Run(config, env, evaluate, folder, hooks or Hooks(), loop or begin_compiling(config, env)).finish()
 
 
 class _Run:
@@ -161,7 +157,7 @@ class _Run:
         self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks, loop: Future[Any]
     ) -> None:
         self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
-        self.folder = folder / CHECKPOINTS
+        self.log, self.folder = folder, folder / CHECKPOINTS
         self.chunk, self.wall_s = 0, 0.0
         self.evaluated = 0  # chunk after which the agents were evaluated last
         self.best: tuple[Best, ...] = ()
@@ -174,7 +170,7 @@ class _Run:
             self.state: LoopState = checkpoint.unpack(checkpoint.pack(fresh), like)  # laid out as after a checkpoint
         evaluate(_agent(self.state.learner.actor, 0))  # compiles its programs
         self._compiled = loop.result()
-        self.log = Log(folder, self.chunk, hooks.note)
+        log.begin(folder, self.chunk, hooks.note)
         hooks.stage("training")
 
     def _restore_latest(self, like: Any) -> None:
@@ -267,7 +263,7 @@ class _Run:
             scored = self._evaluate(self._actors())
             clocks = {"evaluate_s": time.perf_counter() - wall}
             rows = [{**row, **scores, **clocks} for row, scores in zip(rows, scored, strict=True)]
-        self.hooks.rows([self.log.write(row) for row in rows])
+        self.hooks.rows([log.write(self.log, row) for row in rows])
         return self.hooks.stop()
 
     def _evaluate(self, actors: list[Any]) -> list[dict[str, float]]:

@@ -95,9 +95,9 @@ TEARS = {
     "last-line": lambda text: text[:-40],
     "last-newline": lambda text: text[:-1],
     "zeros-at-the-end": lambda text: text[:-300] + bytes(300),
-    "middle": lambda text: text.replace(b', "env_steps"', b"", 1).replace(b'\n{"seed"', b"", 1),
+    "middle": lambda text: text.replace(b',"env_steps"', b"", 1).replace(b'\n{"seed"', b"", 1),
     "no-utf-8": lambda text: text[:900] + b"\xff\xfe" + text[902:],
-    "another-object": lambda text: text.replace(b'"chunk": 3', b'"chunk": "x"', 1),
+    "another-object": lambda text: text.replace(b'"chunk":3', b'"chunk":"x"', 1),
     "a-number": lambda text: b"17\n" + text,
 }
 
