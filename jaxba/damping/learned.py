@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -110,14 +110,6 @@ class LearnedPolicy(ArrayRecord, AgentPolicy):
             x = jax.nn.relu(x @ layer.kernel + layer.bias)
         outputs = x @ self.layers[-1].kernel + self.layers[-1].bias
         return jnp.tanh(outputs[: outputs.shape[0] // 2])
-
-
-def without_weights(policy: LearnedPolicy) -> LearnedPolicy:
-    """The policy with all weights zero and the biases of its last layer: one and the same action. Its twin without
-    learning, as far as one is to be had without a search."""
-    zeros = jax.tree.map(jnp.zeros_like, policy.layers)
-    last = zeros[-1]._replace(bias=policy.layers[-1].bias)
-    return replace(policy, layers=(*zeros[:-1], last))
 
 
 def always(action: float, config: AgentConfig) -> LearnedPolicy:

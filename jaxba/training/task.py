@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import LearnedPolicy, boldest, learned_from, without_weights
-from jaxba.damping.policy import trained_step
-from jaxba.damping.registry import BOLD, GUARDED, LEARNED
+from jaxba.damping.learned import LearnedPolicy, boldest, learned_from
+from jaxba.damping.registry import BOLD, LEARNED
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
 from jaxba.game.rollout import Trajectories
@@ -31,30 +30,17 @@ from jaxba.training.config import TrainConfig
 BANK = "bank.npz"
 RULES = "rules.npz"
 
-EMBEDDED = "+embedded"  # ending of the name of a rule that has the embedded iterations of the agent's step
 CONSTANT = "constant action"  # name of the best constant action on training scenes
 
-BASELINES = (  # rules without the ending have plain steps; `bold` the game's guard; `guarded`, `learned` their own
-    "ceres",
-    "classic",
-    "gtsam",
-    "gauss-newton",
-    "schedule",
-    f"ceres{EMBEDDED}",
-    f"constant:1e-8{EMBEDDED}",
-    BOLD,
-    GUARDED,
-    LEARNED,
-    CONSTANT,
-)
+BASELINES = ("ceres", "classic", "gtsam", "gauss-newton", "schedule", BOLD, LEARNED, CONSTANT)
+"""Rules and the shipped network with plain steps; `bold` and the constant action with the agent's guard and step."""
 
 TRAINED = "trained"  # name of the trained policy in tables
-WEIGHTLESS = "its weights zero"  # name of the trained policy without its weights (`without_weights`)
 
 Comparison: TypeAlias = tuple[dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]]
-"""Trained policies on the held-out scenes: scores by name (of every agent if there are several, of all agents and of
-their twins, means, and of the baselines); iterations of the trained policies over those of each other row, scene by
-scene (`paired_ratio`), geometric mean over agents; and the same for every agent, over its own twin."""
+"""Trained policies on the held-out scenes: scores by name (of every agent if there are several, the mean of all agents,
+and of the baselines); iterations of the trained policies over those of each baseline, scene by scene (`paired_ratio`),
+geometric mean over agents; and the same for every agent."""
 
 
 @dataclass(frozen=True)
@@ -94,27 +80,22 @@ class Task:
         return found
 
     def compare(self, actors: Sequence[Any]) -> Comparison:
-        """Trained policies and their twins without weights beside the baselines, relative to the best costs of all."""
+        """Trained policies beside the baselines, relative to the best costs of all."""
         tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
-        trained = [self.policy(actor) for actor in actors]
-        groups = {TRAINED: trained, WEIGHTLESS: [without_weights(policy) for policy in trained]}
-        numbered = {f"{name} {k + 1}": one for name, policies in groups.items() for k, one in enumerate(policies)}
-        steps = {name: (policy, self.game.options) for name, policy in numbered.items()}
+        names = [f"{TRAINED} {k + 1}" for k in range(len(actors))]
+        steps = {name: (self.policy(actor), self.game.options) for name, actor in zip(names, actors, strict=True)}
         alone = play_all(self.config.bank.classes, self.held_out, steps, limit)
         best = best_costs({**alone, **self.baseline_runs}, self.held_out)
         found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
-        means = {name: [found.pop(f"{name} {k + 1}") for k in range(len(actors))] for name in groups}
-        each = {f"{TRAINED} {k + 1}": one for k, one in enumerate(means[TRAINED])} if len(actors) > 1 else {}
-        mean = {name: Score(*(float(x) for x in np.mean(rows, axis=0))) for name, rows in means.items()}
-        taken = lambda runs: np.log([np.minimum(iterations_to(run, best, tolerance), limit) for run in runs])
-        played = lambda name: [alone[f"{name} {k + 1}"] for k in range(len(actors))]
-        ours, ratios, by_agent = taken(played(TRAINED)), {}, {}
-        others = {WEIGHTLESS: played(WEIGHTLESS), **{name: [run] for name, run in self.baseline_runs.items()}}
-        for name, runs in others.items():
-            theirs = taken(runs)
-            ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs.mean(axis=0)))
-            by_agent[name] = [float(x) for x in np.exp(np.mean(ours - theirs, axis=1))]
-        return {**each, **mean, **found}, ratios, by_agent
+        each = {name: found.pop(name) for name in names}
+        mean = Score(*(float(x) for x in np.mean(list(each.values()), axis=0)))
+        taken = lambda run: np.log(np.minimum(iterations_to(run, best, tolerance), limit))
+        ours, ratios, by_agent = np.stack([taken(alone[name]) for name in names]), {}, {}
+        for name, run in self.baseline_runs.items():
+            theirs = taken(run)
+            ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs))
+            by_agent[name] = np.exp(np.mean(ours - theirs, axis=1)).tolist()
+        return {**(each if len(actors) > 1 else {}), TRAINED: mean, **found}, ratios, by_agent
 
 
 def first_scenes(training: Sequence[Bank], held_out: Sequence[Bank]) -> tuple[Bank, ...]:
@@ -180,27 +161,10 @@ def baseline_policies(
     config: TrainConfig, options: StepOptions, names: Sequence[str]
 ) -> dict[str, tuple[DampingPolicy, StepOptions]]:
     """Policy and step of every baseline, in the order of the table; `options` are those of the agent's step. Names are
-    as in `BASELINES`, without `CONSTANT`. Those with embedded iterations, `guarded` among them, are left out if the
-    agent's step has none; the rule that belongs to the method comes first."""
-    plain = config.step_options
-    has_embedded = options.refinement != plain.refinement
+    as in `BASELINES`, without `CONSTANT`; the rule that belongs to the method comes first."""
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
-    found: dict[str, tuple[DampingPolicy, StepOptions]] = {}
-    for name in (*own, *names):
-        rule = name.removesuffix(EMBEDDED)
-        if name == BOLD:
-            found[name] = boldest(config.game.agent), options
-        elif name in (GUARDED, LEARNED):
-            policy = make_policy(name)
-            made_for = trained_step(policy)
-            if has_embedded or made_for.refinement == plain.refinement:
-                step = replace(plain, refinement=made_for.refinement, coordinates=made_for.coordinates)
-                found[name] = policy, step
-        elif rule == name:
-            found[name] = make_policy(rule), plain
-        elif has_embedded:
-            found[name] = make_policy(rule), options
-    return found
+    found = {name: (make_policy(name), config.step_options) for name in (*own, *names)}
+    return found | ({BOLD: (boldest(config.game.agent), options)} if BOLD in found else {})
 
 
 def _write_banks(path: Path, splits: list[Split]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxba.training.log import Row
 
-YARDSTICKS = ("ceres", "ceres+embedded", "constant action")  # baselines beside which held-out scores are printed
+YARDSTICKS = ("ceres", "constant action")  # baselines beside which held-out scores are printed
 MOST_ENTROPY = math.log(2)  # nats of a uniform action in (-1, 1)
 RANDOM = 0.1  # nats below `MOST_ENTROPY` within which a policy acts at random: over nine tenths of the range
 SAME = 0.1  # decades of lambda; a policy with a smaller spread over states does the same in every state

@@ -15,7 +15,7 @@ from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin, observation_size
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, always, without_weights
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, always
 from jaxba.damping.policy_file import save_policy
 from jaxba.solver.names import parse_solver
 
@@ -96,12 +96,3 @@ def test_without_options_a_solve_takes_the_step_of_the_policy():
     policy, options = parse_solver("bold").build()
     assert SolveOptions().step_options(policy) == options.step_options(policy)
     assert solve(hard_scene(), "bold").iterations == solve(hard_scene(), policy, options).iterations
-
-
-def test_a_policy_without_its_weights_always_does_what_its_last_biases_say():
-    policy = without_weights(random_policy(4))
-    size = policy.layers[0].kernel.shape[0]
-    expected = np.tanh(random_policy(4).layers[-1].bias[:1])
-    for seed in range(3):
-        seen = jnp.asarray(np.random.default_rng(seed).normal(size=size), jnp.float32)
-        np.testing.assert_allclose(policy.act(seen), expected, rtol=1e-5)  # in float32

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import pytest
 
 from jaxba import make_policy
-from jaxba.damping.agent_config import embedded
 from jaxba.damping.learned import boldest
 from jaxba.training.config import load
 from jaxba.training.task import BASELINES, CONSTANT, baseline_policies
-
-EMBEDDED = (
-    *(f"game.agent.refinement.{name}={value}" for name, value in asdict(embedded().refinement).items()),
-    "game.agent.lens_step=pixels",
-)
-"""An agent whose step has embedded iterations."""
 
 NAMES = tuple(name for name in BASELINES if name != CONSTANT)
 
@@ -27,20 +18,12 @@ def found(preset: str, *overrides: str):
     return config, options, baseline_policies(config, options, NAMES)
 
 
-def test_rules_have_plain_steps_or_the_agents_embedded_iterations():
-    config, options, policies = found("default", *EMBEDDED)
+def test_rules_and_what_ships_have_plain_steps_on_the_games_unknowns():
+    config, _, policies = found("default", "bank.intrinsics=fixed")
     assert tuple(policies) == NAMES
-    assert policies["ceres"] == (make_policy("ceres"), config.step_options)
-    assert policies["ceres+embedded"] == (make_policy("ceres"), options)
-    assert policies["constant:1e-8+embedded"] == (make_policy("constant:1e-8"), options)
-
-
-def test_what_ships_has_its_own_step_on_the_games_unknowns():
-    config, options, policies = found("default", *EMBEDDED, "bank.intrinsics=fixed")
-    policy, step = policies["guarded"]
-    assert policy == make_policy("guarded")
-    assert step == options
-    assert policies["learned"] == (make_policy("learned"), config.step_options)
+    assert config.step_options.intrinsics == "fixed"
+    for name in set(NAMES) - {"bold"}:
+        assert policies[name] == (make_policy(name), config.step_options)
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])
@@ -50,10 +33,5 @@ def test_bold_has_the_guard_and_the_step_of_the_game(preset):
     assert policies["bold"][0].config.escalate == 0.75
 
 
-def test_without_embedded_iterations_only_plain_steps_and_bold_are_left():
-    _, _, policies = found("default")
-    assert list(policies) == ["ceres", "classic", "gtsam", "gauss-newton", "schedule", "bold", "learned"]
-
-
 def test_the_rule_of_the_method_comes_first():
-    assert list(found("default", *EMBEDDED, "method=stba")[2]) == ["stba", *NAMES]
+    assert list(found("default", "method=stba")[2]) == ["stba", *NAMES]

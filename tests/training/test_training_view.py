@@ -17,7 +17,7 @@ from jaxba.training import view
 
 RULES = {
     "ceres": Score(6.0, 5.5, 6.0, 9.0, 0.02, 12.0, 1e-3),
-    "ceres+embedded": Score(5.0, 4.5, 5.0, 7.0, 0.0, 10.0, 1e-4),
+    "constant action": Score(5.0, 4.5, 5.0, 7.0, 0.0, 10.0, 1e-4),
 }
 
 
@@ -38,7 +38,7 @@ def test_a_chunk_has_a_line_and_its_held_out_scores_another():
     first, health, second, warning = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True, decades=6.0, left_s=5.2)
     assert first == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), about 5 s left"
     assert second.startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
-    assert second.endswith(", failures 1.0 % (ceres 6.00, ceres+embedded 5.00), best on training scenes so far")
+    assert second.endswith(", failures 1.0 % (ceres 6.00, constant action 5.00), best on training scenes so far")
     spread = "spread of log10(lambda) over states"
     assert health.endswith(f"critics' loss 0.25, bias +0.5 of -2, entropy -0.50 nats, {spread} 0.00, 0.60, 1.20")
     assert warning == f"warning: 1 of 3 policies do the same in every state ({spread} 0.00)"
