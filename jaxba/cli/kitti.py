@@ -82,7 +82,7 @@ class EvaluateArguments:
     """Lengths of the segments for relative errors."""
 
     out: Annotated[str, "FOLDER"] = "runs/kitti"
-    """Folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
+    """Folder of top-view.png, evaluation.json and the aligned trajectories."""
 
 
 def main() -> None:
@@ -194,7 +194,7 @@ def _evaluate(args: EvaluateArguments) -> int:
 
     files, folder = [args.problem, *args.solutions], Path(args.out)
     names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
-    names += ["evaluation.json", "poses-truth.txt", "top-view.png", "top-view.svg"]
+    names += ["evaluation.json", "poses-truth.txt", "top-view.png"]
     read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
     check_apart({"--out": [folder / name for name in names]}, read)
     side = read_sidecar(args.problem)
@@ -205,7 +205,6 @@ def _evaluate(args: EvaluateArguments) -> int:
     views = [(row["name"] + ate(row), points, poses[:, :, 3]) for row, poses, points in results]
     rows = [numbers for numbers, _, _ in results]
     contents = json.dumps({"frames": side.frames, "results": rows}, allow_nan=False)
-    figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "evaluation.json", contents + "\n")
@@ -213,12 +212,12 @@ def _evaluate(args: EvaluateArguments) -> int:
             evaluate.write_poses(folder / f"poses-{at}-{numbers['name']}.txt", poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
-        drawn = plots.save_figure(figure, folder / "top-view")[0]
+        plots.draw_top_view(folder / "top-view.png", views, None if truth is None else truth[:, :, 3])
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     console = common.console()
     console.print(_evaluate_table(rows, truth))
-    console.print(f"wrote {drawn} and {len(results) + (truth is not None) + 2} files beside it")
+    console.print(f"wrote {folder / 'top-view.png'} and {len(results) + (truth is not None) + 1} files beside it")
     return 0
 
 

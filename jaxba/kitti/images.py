@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import zlib
+import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +13,6 @@ from jaxba.io.files import display_name, reason
 from jaxba.kitti.sequence import Sequence
 from jaxba.problem.bundle_problem import ProblemError
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
 GREY_BITS = 8  # bits per pixel of the images in which key-points are detected
 Reader = Callable[[int], np.ndarray]  # grey image of a frame by its position, shape (height, width), uint8
 
@@ -46,34 +45,21 @@ def image_size(sequence: Sequence) -> tuple[float, float]:
 
 def _decode(path: Path) -> np.ndarray:
     """Grey image of a file, shape (height, width), uint8 or uint16."""
+    from PIL import Image
+
     from jaxba.kitti.opencv import cv2
 
     try:
         data = path.read_bytes()
     except OSError as error:
         raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
-    # a damaged PNG file may be decoded to other pixels, and libpng prints warnings of it
-    complete = _is_complete_png(data) if path.suffix.lower() == ".png" else bool(data)
     # calibration is that of the stored pixels, whatever EXIF says of how to show them
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete else None
+    try:
+        Image.open(io.BytesIO(data)).verify()  # OpenCV may decode a damaged PNG file to other pixels, and prints of it
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (OSError, SyntaxError, ValueError):
+        image = None
     if image is None:
         raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
     return np.asarray(image)
-
-
-def _is_complete_png(data: bytes) -> bool:
-    """Whether the bytes are a complete PNG file, and all its chunks have the right checksums.
-
-    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content."""
-    at = len(PNG_SIGNATURE)
-    if data[:at] != PNG_SIGNATURE:
-        return False
-    while len(data) >= at + 12:
-        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            return False
-        if data[at + 4 : at + 8] == b"IEND":
-            return True
-        at = end
-    return False

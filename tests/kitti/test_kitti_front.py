@@ -160,7 +160,6 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
         "poses-1-solved.txt",
         "poses-truth.txt",
         "top-view.png",
-        "top-view.svg",
     }
     assert {p.name for p in folder.iterdir()} == names
     np.testing.assert_allclose(np.loadtxt(folder / "poses-truth.txt"), np.loadtxt(poses), atol=1e-8)
