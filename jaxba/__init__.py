@@ -52,7 +52,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.part import part
-from jaxba.problem.preprocess import drop_invalid, normalize, perturb
+from jaxba.problem.preprocess import perturb
 from jaxba.problem.residuals import residual
 from jaxba.problem.rigs import Rigs
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
@@ -155,7 +155,6 @@ __all__ = [
     "bundle_adjustment",
     "covariance",
     "differentiable_solve",
-    "drop_invalid",
     "example_problem",
     "from_pycolmap",
     "hold",
@@ -166,7 +165,6 @@ __all__ = [
     "make_env",
     "make_method",
     "make_policy",
-    "normalize",
     "part",
     "perturb",
     "prepare",

@@ -36,6 +36,7 @@ from jaxba.cli.constraints import surveyed
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
 from jaxba.problem.frames import in_frames
+from jaxba.problem.similarity import Similarity, transformed
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 
@@ -86,6 +87,13 @@ def bal_file(name: str) -> Path:
 
 
 # Problems
+
+
+def at_origin(problem: BundleProblem, size: float = 1.0) -> BundleProblem:
+    """The problem moved so that the middle of its points is the origin, and their median distance from it `size`."""
+    points = np.asarray(problem.points) - np.median(problem.points, axis=0)
+    scale = size / np.median(np.abs(points).sum(axis=1))
+    return transformed(problem, Similarity(scale, np.eye(3), -scale * np.median(problem.points, axis=0)))
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Preprocessing of a problem: normalise, shift, perturb, and drop invalid observations."""
+"""Preprocessing of a problem: what is observed, where the scene is; shift and perturb."""
 
 from __future__ import annotations
 
@@ -6,37 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, translations
+from jaxba.problem.geometry import camera_centers, rotation_matrices, translations
 from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity, transformed
-
-SIZE = 100.0  # size of a normalised scene. Source: Ceres `BALProblem::Normalize`
-MIN_DEPTH = 0.1  # smallest depth of an observation in a scene of that size. Source: rootba's experiments
 
 FAR = 10.0
 """Distance of a scene from the origin, relative to its extent, from which it is solved around the origin. BAL rotations
 are about the origin: far from it, small rotations are large motions, which distorts the damping and loses digits."""
 
 MIN_TRACK = 2  # fewest observations that determine a point. Source: rootba, which drops points with fewer
-
-
-def normalize(problem: BundleProblem, size: float = SIZE) -> BundleProblem:
-    """The same problem in coordinates in which the points are centred and have a given spread.
-
-    A similarity moves the marginal median of the points to the origin and scales their median L1 distance from it to
-    `size`, scene units. Residuals are unchanged. Raises ProblemError: `size` is not positive, there are no points, or
-    half of them coincide. Source: Ceres `BALProblem::Normalize` (its median is the upper one of an even count)."""
-    if not (np.isfinite(size) and size > 0):
-        raise ProblemError(f"the size of a normalised scene must be positive, not {size}")
-    points = np.asarray(problem.points, dtype=np.float64)
-    if not len(points):
-        raise ProblemError("the scene has no points to be normalised by")
-    middle = _upper_median(points)
-    spread = float(_upper_median(np.abs(points - middle).sum(axis=1)))
-    if spread == 0:
-        raise ProblemError("the scene has no extent: half of its points are at one place")
-    scale = size / spread
-    return transformed(problem, Similarity(scale, np.eye(3), -scale * middle))
 
 
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
@@ -57,7 +35,7 @@ def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], f
     with np.errstate(all="ignore"):  # a scene that overflows is rejected later, with a message
         positions = np.asarray(problem.points, np.float64)[points]
         centers = camera_centers(np.asarray(problem.cameras, np.float64)[cameras])
-        middle = _upper_median(positions)
+        middle = np.median(positions, axis=0)
         return middle, max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (positions, centers))
 
 
@@ -116,23 +94,3 @@ def perturb(
         cameras[:, 3:6] = translations(rotation_matrices(cameras[:, :3]), centers)
     cameras[:, 3:6] += translation_noise
     return problem.replace(cameras=cameras, points=points)
-
-
-def drop_invalid(problem: BundleProblem, min_depth: float = MIN_DEPTH) -> BundleProblem:
-    """Removes observations of points nearer than `min_depth` (scene units) in front of their camera or behind it.
-
-    Points with fewer than `MIN_TRACK` observations left are removed, the others renumbered. Cameras keep their indices,
-    even without observations. Raises ProblemError: nothing would be left. Source: rootba `BalProblem::filter_obs`."""
-    keep = depths(problem) >= min_depth
-    point_index = np.asarray(problem.point_index)
-    tracks = np.bincount(point_index[keep], minlength=problem.num_points)
-    keep &= tracks[point_index] >= MIN_TRACK
-    if not keep.any():
-        raise ProblemError(f"no point is seen by two cameras from at least {min_depth} away: nothing would be left")
-    return problem.subset(keep, points=np.flatnonzero(tracks >= MIN_TRACK))
-
-
-def _upper_median(values: np.ndarray) -> np.ndarray:
-    """The element of rank n // 2 along the first axis, as C++'s nth_element gives it."""
-    middle = len(values) // 2
-    return np.asarray(np.partition(values, middle, axis=0)[middle])

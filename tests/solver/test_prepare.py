@@ -12,7 +12,7 @@ from support import same_bits
 
 import jaxba
 from jaxba import SolveOptions, lm_step, prepare, solve_loop
-from jaxba.problem.preprocess import FAR, normalize, shift
+from jaxba.problem.preprocess import FAR, shift
 
 OPTIONS = SolveOptions(compilation="full", max_iterations=30)
 
@@ -101,7 +101,7 @@ def test_each_point_comes_back_to_its_own_place():
 
 
 def test_a_scene_far_from_the_origin_is_prepared_near_it_and_comes_back_where_it_was():
-    near = normalize(support.tiny(), 1.0)
+    near = support.at_origin(support.tiny())
     far = shift(near, np.array([100 * FAR, 0.0, 0.0]))
     prepared = prepare(far, "ceres")
     assert np.abs(np.median(prepared.state.points, axis=1)).max() < 10
