@@ -5,9 +5,8 @@ scene units and in the frame that the problem has when the rows are registered, 
 cameras' axes those of COLMAP (`jaxba.problem.row_value.Pose`)."""
 
 from jaxba.residuals.geometry import baseline, control_point, distance, gravity, heading, point_to_plane, position
-from jaxba.residuals.images import depth, lens_bounds, lens_default, lens_defaults, rolling_shutter
+from jaxba.residuals.images import depth, lens_bounds, rolling_shutter
 from jaxba.residuals.motion import imu, preintegrated, relative_pose
 
 __all__ = ["baseline", "control_point", "depth", "distance", "gravity", "heading", "imu", "lens_bounds"]
-__all__ += ["lens_default", "lens_defaults", "point_to_plane", "position", "preintegrated", "relative_pose"]
-__all__ += ["rolling_shutter"]
+__all__ += ["point_to_plane", "position", "preintegrated", "relative_pose", "rolling_shutter"]

@@ -1,19 +1,11 @@
-"""Residuals of images and lenses: depth maps, a rolling shutter, and bounds and a weak prior of lenses."""
+"""Residuals of images and lenses: depth maps, a rolling shutter, and bounds of lenses."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 
-from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.hold import every_lens, number_columns
-from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.residuals import Rows, residual
+from jaxba.problem.residuals import residual
 from jaxba.rotations import rotation_matrix
-
-FOCAL, DISTORTION = 0.01, 0.01
-"""Standard deviations of the logarithm of a focal length and of each number of distortion. Source: OpenSfM's
-`exif_focal_sd` and `radial_distortion_k1_sd`; COLMAP's pull request 4683 tries one pixel, and 1 / focal length."""
 
 
 @residual
@@ -44,21 +36,3 @@ def lens_bounds(lens, *, low, high, sigma):
     d = (excess.reshape(2, -1) / sigma).ravel()
     root = jnp.sqrt(d * d + 1)
     return jnp.where(d < 0, 0.5 / (root + jnp.abs(d)), 0.5 * (d + root))  # the same number, without cancellation
-
-
-@residual
-def lens_default(lens, *, expected, weight, relative):
-    """Differences of the numbers of a lens from expected ones, of their logarithms where `relative` is 1, times a
-    `weight` (one number each)."""
-    ratio = jnp.where(relative > 0, lens.numbers / jnp.where(relative > 0, expected, 1), 1)
-    return weight * jnp.where(relative > 0, jnp.log(ratio), lens.numbers - expected)
-
-
-def lens_defaults(problem: BundleProblem, *, focal: float = FOCAL, distortion: float = DISTORTION) -> Rows:
-    """Rows of `lens_default` for all lenses of a problem that is to be solved: focal lengths are as they are now, with
-    a standard deviation of their logarithms, and distortion is zero, with one for each of its numbers."""
-    lenses = every_lens(problem)
-    used, first = np.unique(lenses.index, return_index=True)
-    long, bent = (number_columns(lenses, [name])[used] for name in ("focal", "distortion"))
-    expected = np.where(long, np.asarray(problem.cameras)[first, POSE_SIZE:], 0.0)
-    return lens_default(lens=used, expected=expected, weight=long / focal + bent / distortion, relative=long)

@@ -189,18 +189,6 @@ def test_bounds_of_lenses_are_a_smooth_hinge_that_acts_everywhere():
     assert len(jaxba.with_residual(problem, rows).residuals.rows[0]) == 5
 
 
-def test_lenses_are_expected_where_they_are_and_without_distortion():
-    problem = scene()
-    rows = residuals.lens_defaults(problem, focal=0.1, distortion=0.5)
-    value = lambda numbers: residuals.lens_default.function(
-        Lens(jnp.asarray(numbers), jnp.asarray(0), ()),
-        **dict(zip(rows.residual.data, [x[1] for x in rows.data], strict=True)),
-    )
-    numbers = problem.cameras[1, 6:] * [np.exp(0.2), 1, 1]
-    np.testing.assert_allclose(value(numbers), [2, numbers[1] / 0.5, numbers[2] / 0.5], atol=1e-12)
-    assert len(jaxba.with_residual(problem, rows).residuals.rows[0]) == 5
-
-
 @pytest.mark.parametrize(
     "rows",
     [
