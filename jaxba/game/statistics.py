@@ -24,16 +24,6 @@ class Reached(NamedTuple):
     seconds: Any
 
 
-class Comparison(NamedTuple):
-    """A solver compared with a yardstick on one target: ratios, and numbers of problems that they are not of."""
-
-    both: int  # problems on which both reached the target; the ratios are geometric means over these
-    only_solver: int  # problems on which only the solver reached it
-    only_yardstick: int
-    iterations: float
-    seconds: float
-
-
 def capped(iterations: Float[np.ndarray, " *shape"], limit: int) -> Float[np.ndarray, " *shape"]:
     """Iterations to a target where a failure counts as the limit, and a target reached at the start as one."""
     return np.clip(iterations, 1.0, limit)
@@ -46,19 +36,6 @@ def geometric_mean(values: Iterable[Any], floor: float = 0.0) -> float:
     if not raised.size or (raised == 0).any():
         return 0.0 if raised.size else math.nan
     return float(np.exp(np.log(raised).mean()))
-
-
-def compare(ours: Reached, theirs: Reached) -> Comparison:
-    """A solver compared with a yardstick, problem by problem."""
-    a, b = np.isfinite(ours.iterations), np.isfinite(theirs.iterations)
-    ratio = lambda x, y, floor: geometric_mean(np.maximum(x[a & b], floor) / np.maximum(y[a & b], floor))
-    return Comparison(
-        both=int(np.sum(a & b)),
-        only_solver=int(np.sum(a & ~b)),
-        only_yardstick=int(np.sum(b & ~a)),
-        iterations=ratio(ours.iterations, theirs.iterations, 1.0),
-        seconds=ratio(ours.seconds, theirs.seconds, SHORTEST_TIME),
-    )
 
 
 def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> tuple[float, float, float]:

@@ -6,10 +6,12 @@ import functools
 import re
 from collections.abc import Iterable
 
+import numpy as np
+
 from jaxba.bench import profile
 from jaxba.bench.profile import Target
 from jaxba.bench.sources import Source, sources
-from jaxba.game.statistics import compare
+from jaxba.game.statistics import SHORTEST_TIME, geometric_mean
 from jaxba.paper import agents, claims, real_problems
 from jaxba.paper.claims import Statement, longer_claim, ratio_claim
 from jaxba.paper.real_problems import Problems
@@ -99,22 +101,25 @@ def speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> c
     """The claim on the ratio of our time to classic's, a geometric mean over the problems on which both reach the
     tolerance. The claim is that ours is faster, or else that it is not; the records are solves of both."""
     table = profile.reach_table(records, Target("tau", tau))
-    ours, classic = table.get(agents.BEST.name, {}), table.get(CLASSIC, {})
-    names = [name for name in ours if name in classic]
-    found = compare(profile.reached(ours, names), profile.reached(classic, names))
-    if not found.both:
+    rows = table.get(agents.BEST.name, {}), table.get(CLASSIC, {})
+    names = [name for name in rows[0] if name in rows[1]]
+    ours, classic = (profile.reached(row, names) for row in rows)
+    success = [np.isfinite(one.iterations) for one in (ours, classic)]
+    both = success[0] & success[1]
+    if not both.any():
         return claims.Claim(text, "figure", "-", "not run")
-    reached, base = ((found.both + alone) / len(names) for alone in (found.only_solver, found.only_yardstick))
-    detail = f"time {found.seconds:.2f} of classic's, {found.both} of {len(names)} problems"
+    one, other = (geometric_mean(times.seconds[both], SHORTEST_TIME) for times in (ours, classic))
+    seconds, (reached, base) = one / other, (float(done.mean()) for done in success)
+    detail = f"time {seconds:.2f} of classic's, {both.sum()} of {len(names)} problems"
     lower = reached < base if faster else base < reached
     status: claims.Status
     if lower and abs(reached - base) > claims.FRACTION_TOLERANCE:
         status, detail = "not", f"{detail}, reached on {100 * reached:.0f} % against {100 * base:.0f} %"
     elif faster:
-        status = "reproduced" if found.seconds <= claims.PARTLY_RATIO else "partly" if found.seconds < 1 else "not"
+        status = "reproduced" if seconds <= claims.PARTLY_RATIO else "partly" if seconds < 1 else "not"
     else:
-        alike = claims.PARTLY_RATIO <= found.seconds <= 1 / claims.PARTLY_RATIO
-        status = "reproduced" if alike else "partly" if found.seconds > 1 else "not"
+        alike = claims.PARTLY_RATIO <= seconds <= 1 / claims.PARTLY_RATIO
+        status = "reproduced" if alike else "partly" if seconds > 1 else "not"
     return claims.Claim(text, "figure", detail, status)
 
 
