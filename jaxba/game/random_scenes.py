@@ -88,14 +88,13 @@ class _Rig(NamedTuple):
 
 
 @for_traces
-@functools.partial(jit, once=True, static_argnames=("kind", "count", "dtype"))
-def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
+@functools.partial(jit, once=True, static_argnames=("kind", "count"))
+def make_scenes(kind: SceneClass, key: Array, count: int) -> Scenes:
     """Random scenes of the shape and family of `kind`, the unusable ones included; see `scene_bank.solve_scenes`. Not
-    of the family `windows`. The same key gives the same scenes; `dtype` is that of all numbers."""
-    check_x64(dtype)
+    of the family `windows`. The same key gives the same scenes."""
+    check_x64("float64")
     one = _paper_scene if kind.family == "paper" else _wide_scene
-    scenes = lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)
-    return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), scenes)
+    return lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)
 
 
 def _log_uniform(key: Array, low: float, high: float, shape: tuple[int, ...] = ()) -> Array:

@@ -103,9 +103,6 @@ class BankConfig:
     problems: tuple[str, ...] = ()
     """Real problems, from which classes of the family `windows` are cut."""
 
-    dtype: str = "float64"
-    """Floating point type of the game's solves."""
-
     intrinsics: Intrinsics = "free"
     """Whether focal lengths and distortions are optimised in the game's solves."""
 
@@ -194,10 +191,10 @@ def make_banks(
         )
         if kind.family == "windows":
             seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))
-            parts = read_windows(problems or config.problems, kind, count, seed, config.dtype)
+            parts = read_windows(problems or config.problems, kind, count, seed)
             banks = [select(*solved(scenes)) for scenes in parts]
         else:
-            made, usable = solved(make_scenes(kind, class_key, count, config.dtype))
+            made, usable = solved(make_scenes(kind, class_key, count))
             rows = np.flatnonzero(usable)
             held = held_out_count(len(rows))
             banks = [select(made, part) for part in (rows[held:], rows[:held])]

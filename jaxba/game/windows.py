@@ -26,11 +26,11 @@ MOVED = 0.5  # share of the windows that begin where random scenes do
 
 
 def read_windows(
-    problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
+    problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int
 ) -> tuple[Scenes, Scenes]:
     """Windows of problems: those to train on, and held-out ones from other places. Problems are in memory, or files. Of
     `count` windows, as many of each problem, a fifth is held out; `kind` has their largest numbers of cameras and
-    points, `seed` is that of the choice, and `dtype` that of all numbers. Raises ProblemError: as `read_all`."""
+    points, and `seed` is that of the choice. Raises ProblemError: as `read_all`."""
     parts: tuple[list, list] = [], []
     for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])
@@ -41,8 +41,8 @@ def read_windows(
                 part.extend(window(problem, kind, linked, cameras, rng) for _ in range(wanted))
     shuffle = np.random.default_rng([seed, len(problems)]).permutation  # so that the first windows are of all problems
     train, held_out = ([part[k] for k in shuffle(len(part))] for part in parts)
-    typed = lambda x: jnp.asarray(x, None if x.dtype == bool else dtype)
-    stack = lambda part: Scenes(*(typed(np.stack([getattr(one, name) for one in part])) for name in Scenes._fields))
+    column = lambda part, name: jnp.asarray(np.stack([getattr(one, name) for one in part]))
+    stack = lambda part: Scenes(*(column(part, name) for name in Scenes._fields))
     return stack(train), stack(held_out)
 
 

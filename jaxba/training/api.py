@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import numpy as np
 
 from jaxba.damping.learned import LearnedPolicy
 from jaxba.game.env import Game, Reward, RewardFunction, make_game
@@ -69,7 +70,7 @@ def make_env(
         config = with_problems(config, names)
     rules = config.game if reward is None else replace(config.game, reward=reward)
     config = replace(config, game=rules)
-    with numerics(config.bank.dtype), process.single_blas_thread():
+    with numerics(np.float64), process.single_blas_thread():
         key, limit = jax.random.key(config.seed), rules.max_iterations
         splits = make_banks(config.bank, key, config.bank.options, limit, report, rules.tolerance, problems)
         game = make_game(rules, config.bank.classes, [x.train for x in splits], config.envs, config.step_options)
@@ -111,7 +112,7 @@ def train(
     work = Task(config, env, env.held_out, {})
     show = lambda rows: print(_line(rows, chunks), flush=True)
     hooks = driver.Hooks(rows=show) if verbose else driver.Hooks()
-    with tempfile.TemporaryDirectory() as temporary, numerics(config.bank.dtype), process.single_blas_thread():
+    with tempfile.TemporaryDirectory() as temporary, numerics(np.float64), process.single_blas_thread():
         place = Path(folder or temporary)
         place.mkdir(parents=True, exist_ok=True)
         outcome = driver.train(config, env, work.evaluate, place, hooks)

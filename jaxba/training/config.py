@@ -46,10 +46,7 @@ class TrainConfig:
     """Chunks between evaluations on held-out scenes; the last chunk is always followed by one."""
 
     checkpoint_every: int = 4
-    """Chunks between checkpoints."""
-
-    keep: int = 2
-    """Checkpoints kept. Each also holds the best policy so far."""
+    """Chunks between checkpoints, of which the last two are kept. Each also holds the best policy so far."""
 
     envs: tuple[int, ...] = (64,)
     """Environments of each class of scenes."""
@@ -87,7 +84,7 @@ class TrainConfig:
         return method.options(plain)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
+        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every"):
             check_count(name, getattr(self, name), 1)
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 to 2147483647, not {self.seed}")
@@ -97,8 +94,6 @@ class TrainConfig:
             raise ValueError(f"envs: every class needs at least one environment, not {min(self.envs)}")
         if sum(self.envs) > self.loop.replay_capacity:
             raise ValueError(f"loop.replay_capacity must be at least the {sum(self.envs)} environments")
-        if self.bank.dtype not in ("float64", "float32"):
-            raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
         _ = self.step_options  # raises ValueError if impossible

@@ -33,7 +33,8 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 
 _METADATA = ("chunk", "wall_s", "evaluated", "best")  # what a checkpoint holds besides arrays
-CHANGEABLE = ("chunks", "keep", "checkpoint_every")  # settings that a resumed run may change
+CHANGEABLE = ("chunks", "checkpoint_every")  # settings that a resumed run may change
+KEPT = 2  # checkpoints: of a damaged one the one before is left
 SCORE = "training/score"  # the metric by which policies are chosen: lower is better
 
 
@@ -209,7 +210,7 @@ class _Run:
         best = [{"score": one.score, "chunk": one.chunk} for one in self.best]
         metadata: dict[str, Any] = dict(zip(_METADATA, (self.chunk, self.wall_s, self.evaluated, best), strict=True))
         try:
-            checkpoint.save(self.folder, self.chunk, arrays, metadata, self.config.keep)
+            checkpoint.save(self.folder, self.chunk, arrays, metadata, KEPT)
         except TrainError as error:
             raise TrainError(f"{error}; --resume goes on from the one before") from None
 

@@ -255,7 +255,7 @@ def test_nothing_to_resume(tmp_path):
 
 
 def test_a_resumed_run_may_not_become_another(whole):
-    with pytest.raises(TrainError, match=r"begun with another sac\.width; a resumed run may change chunks, keep"):
+    with pytest.raises(TrainError, match=r"another sac\.width; a resumed run may change chunks, checkpoint_every"):
         prepare_folder(whole[0], None, True, ("sac.width=9",))
     with pytest.raises(TrainError, match="begun with another seed"):
         prepare_folder(whole[0], dataclasses.replace(CONFIG, seed=1), True)
