@@ -44,7 +44,7 @@ from jaxba.damping.learned import AgentPolicy, ConstantAction
 from jaxba.game.env import Episode, Game, GameConfig, make_game
 from jaxba.game.evaluate import best_constant_action
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.scene_bank import Bank, BankConfig, make_banks
+from jaxba.game.scene_bank import Bank, BankConfig, make_split
 from jaxba.game.statistics import paired_ratio
 from jaxba.runtime import process
 from jaxba.runtime.groups import step_groups
@@ -103,7 +103,6 @@ class Played(NamedTuple):
 
 def play_on(
     game: Game,
-    kind: SceneClass,
     bank: Bank,
     policy: AgentPolicy,
     actions: Float[Array, "tries actions"],
@@ -113,13 +112,12 @@ def play_on(
 
     Args:
         game: rules; `reward` and bonus play no part.
-        kind: class of the bank.
         bank: scenes.
         policy: an agent's, of the same configuration as the game's.
         actions: first actions.
         start: state of the episode.
     """
-    advance = functools.partial(_advance, game, kind, bank)
+    advance = functools.partial(_advance, game, bank)
     first = jax.vmap(lambda action: advance(Played(start, jnp.zeros((), bool)), action))
 
     def turn(run: Played) -> Played:
@@ -130,8 +128,8 @@ def play_on(
     return lax.while_loop(under_way, lambda runs: step_groups(turn, runs), first(actions)).iterations
 
 
-def _advance(game: Game, kind: SceneClass, bank: Bank, run: Played, action: Float[Array, " actions"]) -> Played:
-    episode, step = game.iterate(kind, bank, run.episode, action)
+def _advance(game: Game, bank: Bank, run: Played, action: Float[Array, " actions"]) -> Played:
+    episode, step = game.iterate(bank, run.episode, action)
     return Played(episode, step.cost <= bank.best_cost[episode.scene] * (1 + game.config.tolerance))
 
 
@@ -143,17 +141,17 @@ def _ended(game: Game, run: Played) -> Bool[Array, ""]:
     return run.success | (run.iterations >= game.config.max_iterations)
 
 
-@functools.partial(jax.jit, static_argnames=("number", "looks"))
-def _look_ahead(game: Game, number: int, policy: AgentPolicy, actions: Array, looks: bool) -> tuple[Array, Array]:
-    kind, bank = game.kinds[number], game.banks[number]
+@functools.partial(jax.jit, static_argnames=("looks",))
+def _look_ahead(game: Game, policy: AgentPolicy, actions: Array, looks: bool) -> tuple[Array, Array]:
+    bank = game.bank
 
     def one(scene: Int[Array, ""]) -> tuple[Array, Array]:
         def body(run: Played) -> Played:
             own = _action(policy, run)
             if looks:
                 tried = jnp.concatenate([own[None], actions.astype(own.dtype)])
-                own = tried[jnp.argmin(play_on(game, kind, bank, policy, tried, run.episode))]
-            return _advance(game, kind, bank, run, own)
+                own = tried[jnp.argmin(play_on(game, bank, policy, tried, run.episode))]
+            return _advance(game, bank, run, own)
 
         start = Played(game.start(bank, scene), jnp.zeros((), bool))
         end = lax.while_loop(lambda run: ~_ended(game, run), body, start)
@@ -164,22 +162,20 @@ def _look_ahead(game: Game, number: int, policy: AgentPolicy, actions: Array, lo
 
 def look_ahead(
     game: Game, policy: AgentPolicy, actions: Float[np.ndarray, "tries actions"], looks: bool = True
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Plays every scene of a game's banks with look-ahead.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plays every scene of a game's bank with look-ahead.
 
     Args:
-        game: the banks and the rules.
+        game: the bank and the rules.
         policy: the base policy.
         actions: tried in every state, beside the policy's own.
         looks: if False, the policy plays alone.
 
     Returns:
-        Iterations of every scene and whether it was solved, for each bank.
+        Iterations of every scene and whether it was solved.
     """
     tried = jnp.asarray(actions, jnp.float32)
-    return [
-        jax.tree.map(np.asarray, _look_ahead(game, number, policy, tried, looks)) for number in range(len(game.kinds))
-    ]
+    return jax.tree.map(np.asarray, _look_ahead(game, policy, tried, looks))
 
 
 class Labels(NamedTuple):
@@ -190,9 +186,9 @@ class Labels(NamedTuple):
     scene: Any  # (states,)
 
 
-@functools.partial(jax.jit, static_argnames=("number",))
-def _collect(game: Game, number: int, policy: AgentPolicy, actions: Array, key: Array) -> tuple[Array, ...]:
-    kind, bank = game.kinds[number], game.banks[number]
+@jax.jit
+def _collect(game: Game, policy: AgentPolicy, actions: Array, key: Array) -> tuple[Array, ...]:
+    bank = game.bank
 
     def one(scene: Int[Array, ""]) -> tuple[Array, ...]:
         def body(run: Played, key: Array) -> tuple[Played, tuple[Array, ...]]:
@@ -200,14 +196,14 @@ def _collect(game: Game, number: int, policy: AgentPolicy, actions: Array, key: 
             tried = jnp.concatenate([_action(policy, run)[None], actions.astype(jnp.float32)])
             taken = lax.cond(
                 alive,
-                lambda episode: play_on(game, kind, bank, policy, tried, episode),
+                lambda episode: play_on(game, bank, policy, tried, episode),
                 lambda _: jnp.zeros(tried.shape[0], run.iterations.dtype),
                 run.episode,
             )
             explores, which = jax.random.split(key)
             drawn = jax.random.randint(which, (), 0, tried.shape[0])
             pick = jnp.where(jax.random.bernoulli(explores, EXPLORED), drawn, 0)
-            after = _advance(game, kind, bank, run, tried[pick])
+            after = _advance(game, bank, run, tried[pick])
             after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, run)
             left = taken - run.iterations
             return after, (alive, observe(policy.config, run.episode.memory), left)
@@ -219,8 +215,8 @@ def _collect(game: Game, number: int, policy: AgentPolicy, actions: Array, key: 
 
 
 def collect(game: Game, policy: AgentPolicy, actions: Float[np.ndarray, "tries actions"], seed: int) -> Labels:
-    """Exact labels of the states of the base's episodes on the first bank of a game."""
-    found = _collect(game, 0, policy, jnp.asarray(actions, jnp.float32), jax.random.key(seed))
+    """Exact labels of the states of the base's episodes on the bank of a game."""
+    found = _collect(game, policy, jnp.asarray(actions, jnp.float32), jax.random.key(seed))
     alive, seen, left = (np.asarray(x) for x in found)
     scene = np.broadcast_to(np.arange(len(alive))[:, None], alive.shape)
     return Labels(seen[alive], np.maximum(left[alive], 1), scene[alive])
@@ -326,16 +322,16 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     say = lambda text: print(f"{time.perf_counter() - began:5.0f} s  {text}", flush=True)
     agent = replace(AgentConfig() if step == "plain" else embedded(), **FREE)
     kind = SceneClass(10, 80, family="windows") if args.problems else SceneClass(10, 40)
-    bank_config = BankConfig((kind,), (args.scenes,), problems=tuple(map(str, args.problems)))
+    bank_config = BankConfig(kind, args.scenes, problems=tuple(map(str, args.problems)))
     rules = GameConfig(agent, reward="constant", tolerance=1e-4)
     options = agent.step_options(bank_config.options)
     key = jax.random.key(args.seed)
-    (split,) = make_banks(bank_config, key, bank_config.options, rules.max_iterations, say, rules.tolerance)
+    split = make_split(bank_config, key, bank_config.options, rules.max_iterations, say, rules.tolerance)
     say(f"{len(split.train.initial_cost)} scenes, {len(split.held_out.initial_cost)} held out")
-    base = best_constant_action((kind,), (split.train,), rules, options)
+    base = best_constant_action(kind, split.train, rules, options)
     say(f"base: action {base.action[0]:.2f}")
     actions = np.array([[action_of(agent, jnp.float32(decades))] for decades in DECADES]).clip(-1, 1)
-    game = lambda bank: make_game(rules, [kind], [bank], [1], bank_config.options)
+    game = lambda bank: make_game(rules, kind, bank, 1, bank_config.options)
     labels = collect(game(split.train), base, actions, args.seed)
     hindsight = np.exp(np.log(labels.iterations.min(axis=1) / labels.iterations[:, 0]).mean())
     say(f"{len(labels.scene)} states; the best first action of each in hindsight {hindsight:.3f}")
@@ -343,7 +339,7 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     say(f"R2 of the actions {np.round(explained, 2)}, margin {float(policy.margin):.2f}")
     taken = {}
     for name, one, looks in (("base", base, False), ("foresight", base, True), ("predicted", policy, False)):
-        ((taken[name], _),) = look_ahead(game(split.held_out), one, actions, looks)
+        taken[name], _ = look_ahead(game(split.held_out), one, actions, looks)
         say(f"{name}: {np.exp(np.log(taken[name]).mean()):.2f} iterations")
     shown = lambda name: "{:.3f} [{:.3f}, {:.3f}]".format(*paired_ratio(taken[name], taken["base"]))
     damping = 10 ** (0.5 * (agent.low + agent.high) + 0.5 * (agent.high - agent.low) * base.action[0])

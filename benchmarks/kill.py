@@ -28,8 +28,8 @@ from jaxba.training import checkpoint, log
 from jaxba.training.driver import CHECKPOINTS, CONFIG
 
 SETTINGS = [
-    *("chunks=48", "evaluate_every=4", "checkpoint_every=1", "envs=[8]"),
-    *("bank.classes=[{cameras: 4, points: 12, family: paper}]", "bank.scenes=[160]", "bank.refine_points=0"),
+    *("chunks=48", "evaluate_every=4", "checkpoint_every=1", "envs=8"),
+    *("bank.kind={cameras: 4, points: 12, family: paper}", "bank.scenes=160", "bank.refine_points=0"),
     *("game.max_iterations=12", "game.agent.refine_points=0", "game.agent.trials=1", "game.agent.camera_rounds=0"),
     "game.agent.pattern_moves=0",
     *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),

@@ -71,7 +71,7 @@ def score(env: PresetGame, policy: Any) -> float:
     rules = env.config
     limits = rules.tolerance, rules.max_iterations
     with numerics("float64"):
-        return evaluate(env.kinds, env.held_out, policy, env.options, *limits).mean
+        return evaluate(env.kind, env.held_out, policy, env.options, *limits).mean
 
 
 def ours(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
@@ -138,7 +138,7 @@ def judged(run: Run, found: float, target: float) -> Run:
 def main() -> None:
     """Prints the table."""
     args = tyro.cli(Arguments, description=__doc__)
-    sizes = f"bank.scenes=[{args.scenes}]", f"envs=[{args.envs}]", f"loop.updates_per_step={args.updates}"
+    sizes = f"bank.scenes={args.scenes}", f"envs={args.envs}", f"loop.updates_per_step={args.updates}"
     env = jaxba.make_env("default", *sizes, "sac.batch=256", report=print)
     rule = score(env, jaxba.make_policy("ceres"))
     print(f"held-out scenes: Ceres' rule takes {rule:.2f} iterations, to reach {TARGET * rule:.2f}", flush=True)

@@ -27,7 +27,7 @@ from jaxba import StepOptions
 from jaxba.game.env import GameConfig, make_game
 from jaxba.game.gym import GymVectorGame
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.scene_bank import BankConfig, make_banks
+from jaxba.game.scene_bank import BankConfig, make_split
 
 
 class ForStableBaselines(VecEnv):
@@ -101,10 +101,10 @@ def main() -> None:
     config = GameConfig()
     options = config.agent.step_options(StepOptions())
     print("making scenes", flush=True)
-    bank = BankConfig(classes=(kind,), scenes=(arguments.scenes,))
+    bank = BankConfig(kind=kind, scenes=arguments.scenes)
     with jax.enable_x64(True):  # the game counts in float64, but sbx in float32: the adapter keeps them apart
-        (split,) = make_banks(bank, jax.random.key(0), options, config.max_iterations)
-        game = make_game(config, [kind], [split.train], [arguments.envs])
+        split = make_split(bank, jax.random.key(0), options, config.max_iterations)
+        game = make_game(config, kind, split.train, arguments.envs)
     envs = ForStableBaselines(GymVectorGame(game))
 
     watch = Watch(arguments.seconds)

@@ -27,7 +27,7 @@ def tiny_bank() -> Bank:
 
 def tiny_game(config: GameConfig = RULES, envs: int = 6) -> Game:
     """A game on them."""
-    return make_game(config, [KIND], [tiny_bank()], [envs])
+    return make_game(config, KIND, tiny_bank(), envs)
 
 
 def grid(kind: SceneClass, scenes: Scenes) -> np.ndarray:

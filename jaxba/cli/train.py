@@ -47,8 +47,7 @@ class Arguments:
 
     problems: Annotated[tuple[str, ...], "FILE ..."] = ()
     """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are windows of neighbouring
-    cameras; the last fifth of every problem is held out. They replace the configuration's classes of windows, or all
-    classes if it has none."""
+    cameras; the last fifth of every problem is held out."""
 
     resume: bool = False
     """Continue the run in the folder from its last checkpoint: the same results as without interruption, bit by bit."""
@@ -216,12 +215,11 @@ def _finish(
     rules_of_game = work.config.game
     stages("comparing with the rules")
     compared = work.compare([one.actor for one in best])
-    table = _table(compared, rules_of_game.tolerance, sum(len(bank.initial_cost) for bank in work.held_out))
+    table = _table(compared, rules_of_game.tolerance, len(work.held_out.initial_cost))
     stages("episodes and page")
     chosen = best_of(best)
-    kind, bank = work.config.bank.classes[0], work.held_out[0]
     policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
-    episodes = play(kind, bank, policy, work.game.options, limit)
+    episodes = play(work.game.kind, work.held_out, policy, work.game.options, limit)
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE
     write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts))

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -108,9 +108,9 @@ class Episode(NamedTuple):
 
 
 class GameState(NamedTuple):
-    """All environments; a tuple entry per class of scenes."""
+    """All environments."""
 
-    episodes: tuple[Episode, ...]
+    episodes: Episode
     key: Array
 
 
@@ -119,25 +119,20 @@ class GameState(NamedTuple):
 class Game:
     """A batch of environments; satisfies `protocol.Environment`."""
 
-    banks: tuple[Bank, ...]
-    """Scenes to play, a bank per class."""
+    bank: Bank
+    """Scenes to play."""
 
-    kinds: tuple[SceneClass, ...] = field(metadata={"static": True})
-    """Classes of the banks."""
+    kind: SceneClass = field(metadata={"static": True})
+    """Class of these."""
 
-    envs: tuple[int, ...] = field(metadata={"static": True})
-    """Environments of each class."""
+    num_envs: int = field(metadata={"static": True})
+    """Environments that step together."""
 
     config: GameConfig = field(metadata={"static": True})
     """Rules."""
 
     options: StepOptions = field(metadata={"static": True})
     """Of the LM step, those of the agent's configuration included (`AgentConfig.step_options`)."""
-
-    @property
-    def num_envs(self) -> int:
-        """Environments that step together."""
-        return sum(self.envs)
 
     @property
     def observation_size(self) -> int:
@@ -157,22 +152,15 @@ class Game:
     @for_traces
     def reset(self, key: Array) -> tuple[GameState, Float[Array, "envs features"]]:
         """New episodes everywhere."""
-        check_x64(self.banks[0].initial_cost.dtype)
-        key, *keys = jax.random.split(key, 1 + len(self.kinds))
-        episodes = tuple(
-            jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(jax.random.split(k, count))
-            for bank, k, count in zip(self.banks, keys, self.envs, strict=True)
-        )
+        check_x64(self.bank.initial_cost.dtype)
+        key, own = jax.random.split(key)
+        episodes = jax.vmap(functools.partial(self._fresh, self.bank))(jax.random.split(own, self.num_envs))
         state = GameState(episodes, key)
         return state, self.observations(state)
 
     def observations(self, state: GameState) -> Float[Array, "envs features"]:
         """What is observed everywhere, for the next actions."""
-        seen = [
-            jax.vmap(functools.partial(self._observe, bank))(part)
-            for bank, part in zip(self.banks, state.episodes, strict=True)
-        ]
-        return jnp.concatenate(seen)
+        return jax.vmap(functools.partial(self._observe, self.bank))(state.episodes)
 
     def _observe(self, bank: Bank, episode: Episode) -> Float[Array, " features"]:
         distance = episode.state.cost / bank.best_cost[episode.scene] - 1
@@ -191,12 +179,10 @@ class Game:
         state = LMState(scenes.cameras, scenes.points, initial)
         return Episode(scene, state, begin(self.config.agent, info))
 
-    def iterate(
-        self, kind: SceneClass, bank: Bank, episode: Episode, action: Float[Array, " actions"]
-    ) -> tuple[Episode, StepInfo]:
+    def iterate(self, bank: Bank, episode: Episode, action: Float[Array, " actions"]) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
         agent, memory = self.config.agent, episode.memory
-        layout = class_layout(kind, self.options)
+        layout = class_layout(self.kind, self.options)
         layout = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
         damping = damping_of(agent, memory.guard, action[0])
         state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, memory.iteration)
@@ -205,24 +191,18 @@ class Game:
     @for_traces
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
         """Plays one action everywhere. Raises ValueError: actions of another shape."""
-        check_x64(self.banks[0].initial_cost.dtype)
+        check_x64(self.bank.initial_cost.dtype)
         if (expected := (self.num_envs, self.action_size)) != (shape := jnp.shape(action)):
             raise ValueError(f"actions must have shape {expected}, not {shape}")
-        key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
-        parts, after, start = [], [], 0
-        for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
-            own = action[start : start + count], jax.random.split(k, count)
-            start += count
-            play = functools.partial(self._play, kind)
-            episodes, step = step_groups(play, episodes, *own, shared=bank)
-            parts.append(step)
-            after.append(episodes)
-        return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        key, own = jax.random.split(state.key)
+        keys = jax.random.split(own, self.num_envs)
+        episodes, step = step_groups(self._play, state.episodes, action, keys, shared=self.bank)
+        return GameState(episodes, key), step
 
-    def _play(self, kind: SceneClass, bank: Bank, episode: Episode, action: Array, key: Array) -> tuple[Episode, Step]:
+    def _play(self, bank: Bank, episode: Episode, action: Array, key: Array) -> tuple[Episode, Step]:
         rules = self.config
         best = bank.best_cost[episode.scene]
-        after, step = self.iterate(kind, bank, episode, action)
+        after, step = self.iterate(bank, episode, action)
         success = step.cost <= best * (1 + rules.tolerance)
         terminated = success | (after.memory.iteration >= rules.max_iterations)
         reward = self._reward(step, after.memory, best, success)
@@ -259,8 +239,7 @@ class Game:
         """Uniform actions in half of the environments; Ceres' rule in a quarter, a hundredth of it in the last one."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        rules = [jax.vmap(_rule_damping)(part.memory) for part in state.episodes]
-        rule = jnp.concatenate(rules) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        rule = jax.vmap(_rule_damping)(state.episodes.memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
@@ -274,15 +253,10 @@ def _rule_damping(memory: Memory) -> Array:
 
 
 def make_game(
-    config: GameConfig,
-    kinds: Sequence[SceneClass],
-    banks: Sequence[Bank],
-    envs: Sequence[int],
-    options: StepOptions | None = None,
+    config: GameConfig, kind: SceneClass, bank: Bank, num_envs: int, options: StepOptions | None = None
 ) -> Game:
-    """A game on `banks` of scenes of the classes `kinds`, with the rules of `config` and `envs` environments of each
-    class. The agent's configuration overrides the `options` of the LM step (`AgentConfig.step_options`)."""
+    """A game on a bank of scenes of the class `kind`, with the rules of `config` and so many environments. The agent's
+    configuration overrides the `options` of the LM step (`AgentConfig.step_options`)."""
     options = config.agent.step_options(options or StepOptions())
-    for kind in kinds:
-        class_layout(kind, options)  # cached on the host before anything is traced
-    return Game(tuple(banks), tuple(kinds), tuple(envs), config, options)
+    class_layout(kind, options)  # cached on the host before anything is traced
+    return Game(bank, kind, num_envs, config, options)

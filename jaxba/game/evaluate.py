@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -34,41 +34,38 @@ class Score(NamedTuple):
     """Median of the final cost over the best known, less one."""
 
 
-def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int) -> Score:
-    """The score of a policy's runs on several banks; every scene has the same weight."""
-    iterations = iterations_to(runs, best, tolerance)
+def score(run: Trajectories, best: Float[np.ndarray, " scenes"], tolerance: float, limit: int) -> Score:
+    """The score of a policy's run on a bank, whose best known costs are given."""
+    iterations = iterations_to(run, best, tolerance)
     counted = capped(iterations, limit)
-    ends = np.concatenate([run.costs[:, -1] / b - 1 for run, b in zip(runs, best, strict=True)])
-    length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
     return Score(
         mean=float(counted.mean()),
         geometric_mean=geometric_mean(counted),
         median=float(np.median(counted)),
         p90=float(np.percentile(counted, 90)),
         failures=float(np.mean(~(iterations <= limit))),
-        to_convergence=float(length.mean()),
-        end=float(np.median(ends)),
+        to_convergence=float(np.where(run.converged, run.iterations, limit).mean()),
+        end=float(np.median(run.costs[:, -1] / best - 1)),
     )
 
 
 def iterations_to(
-    runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float
+    run: Trajectories, best: Float[np.ndarray, " scenes"], tolerance: float
 ) -> Float[np.ndarray, " scenes"]:
-    """Iterations to within a tolerance of every scene of several banks, at least 1; infinite for a failure."""
-    return np.maximum(np.concatenate([reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]), 1)
+    """Iterations to within a tolerance of every scene's best cost, at least 1; infinite for a failure."""
+    return np.maximum(reach(run.costs, best, tolerance), 1)
 
 
 def evaluate(
-    kinds: Sequence[SceneClass],
-    banks: Sequence[Bank],
+    kind: SceneClass,
+    bank: Bank,
     policy: DampingPolicy,
     options: StepOptions,
     tolerance: float = 1e-3,
     limit: int = 40,
 ) -> Score:
     """A policy's score on all scenes, in at most `limit` linear solves; `tolerance` is relative to the best cost."""
-    runs = play_all(kinds, banks, {"": (policy, options)}, limit)[""]
-    return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
+    return score(play(kind, bank, policy, options, limit), np.asarray(bank.best_cost), tolerance, limit)
 
 
 CONSTANT_ACTIONS = tuple(float(x) for x in np.linspace(-1.0, 1.0, 12))
@@ -76,56 +73,45 @@ CONSTANT_ACTIONS = tuple(float(x) for x in np.linspace(-1.0, 1.0, 12))
 
 
 def best_constant_action(
-    kinds: Sequence[SceneClass],
-    banks: Sequence[Bank],
+    kind: SceneClass,
+    bank: Bank,
     rules: GameConfig,
     options: StepOptions,
     beside: Mapping[str, tuple[DampingPolicy, StepOptions]] | None = None,
 ) -> ConstantAction:
-    """The constant action with the fewest mean iterations: what an agent must beat to have learned something. The banks
-    are those of training; `beside` are policies that are played, too, so that all share programs."""
+    """The constant action with the fewest mean iterations: what an agent must beat to have learned something. The bank
+    is that of training; `beside` are policies that are played, too, so that all share programs."""
     tried = {str(action): ConstantAction((action,), rules.agent) for action in CONSTANT_ACTIONS}
     steps = alike({**(beside or {}), **{name: (one, options) for name, one in tried.items()}})
-    mean = lambda name: evaluate(kinds, banks, *steps[name], rules.tolerance, rules.max_iterations).mean
+    mean = lambda name: evaluate(kind, bank, *steps[name], rules.tolerance, rules.max_iterations).mean
     return tried[min(tried, key=mean)]
 
 
-Runs = list[Trajectories]  # trajectories of one policy on each bank
-
-
 def play_all(
-    kinds: Sequence[SceneClass],
-    banks: Sequence[Bank],
-    policies: Mapping[str, tuple[DampingPolicy, StepOptions]],
-    limit: int = 40,
-) -> dict[str, Runs]:
+    kind: SceneClass, bank: Bank, policies: Mapping[str, tuple[DampingPolicy, StepOptions]], limit: int = 40
+) -> dict[str, Trajectories]:
     """Trajectories of every policy on every scene, by the policy's name. Those with equal steps share programs."""
-    return {
-        name: [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
-        for name, (policy, options) in alike(policies).items()
-    }
+    return {name: play(kind, bank, *one, limit) for name, one in alike(policies).items()}
 
 
-def best_costs(runs: Mapping[str, Runs], banks: Sequence[Bank]) -> list[np.ndarray]:
+def best_costs(runs: Mapping[str, Trajectories], bank: Bank) -> Float[np.ndarray, " scenes"]:
     """The lowest cost of each scene in the bank and in all runs."""
-    return [
-        np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
-        for k, bank in enumerate(banks)
-    ]
+    return np.min([np.asarray(bank.best_cost), *(run.costs[:, -1] for run in runs.values())], axis=0)
 
 
 def scores(
-    policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
+    policies: Mapping[str, Trajectories], rules: Mapping[str, Trajectories], bank: Bank, tolerance: float, limit: int
 ) -> dict[str, Score]:
     """Scores of all policies and rules, and as `virtual best` that of the best rule for each scene: the lowest cost
     after each iteration, and the fewest iterations to convergence, each of the rule that has it.
 
     The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores."""
-    runs = {**policies, **rules}
-    best, lowest = best_costs(runs, banks), []
-    for of_bank in zip(*rules.values(), strict=True):
-        length = np.min([np.where(run.converged, run.iterations, limit) for run in of_bank], axis=0)
-        costs = np.min([run.costs for run in of_bank], axis=0)
-        converged = np.any([run.converged for run in of_bank], axis=0)
-        lowest.append(Trajectories(costs, of_bank[0].dampings, length, converged))
+    runs, every = {**policies, **rules}, rules.values()
+    lowest = Trajectories(
+        costs=np.min([run.costs for run in every], axis=0),
+        dampings=next(iter(every)).dampings,
+        iterations=np.min([np.where(run.converged, run.iterations, limit) for run in every], axis=0),
+        converged=np.any([run.converged for run in every], axis=0),
+    )
+    best = best_costs(runs, bank)
     return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

@@ -61,7 +61,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
             raise ValueError(f"reset has no options, is given {', '.join(options)}")
         super().reset(seed=seed)
         game = self._opened()
-        with numerics(game.banks[0].initial_cost.dtype, single_blas=False):
+        with numerics(game.bank.initial_cost.dtype, single_blas=False):
             self._state, observation = _reset(game, jax.random.key(int(self.np_random.integers(2**31))))
             return np.array(observation[:, : self._features]), {}
 
@@ -71,7 +71,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         actions = _actions(actions, self.action_space.shape)
-        with numerics(game.banks[0].initial_cost.dtype, single_blas=False):
+        with numerics(game.bank.initial_cost.dtype, single_blas=False):
             self._state, found = _step(game, self._state, jnp.asarray(actions, jnp.float32))
             step: Any = jax.tree.map(np.array, found)  # copies, which callers may keep and write to
         infos = _infos(step, step.final_observation[:, : self._features], step.terminated | step.truncated)

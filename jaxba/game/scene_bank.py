@@ -91,17 +91,17 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
 class BankConfig:
     """How many scenes of which kind."""
 
-    classes: tuple[SceneClass, ...] = field(default_factory=lambda: (SceneClass(10, 40),))
-    """Shapes of scenes; each is a program of its own."""
+    kind: SceneClass = field(default_factory=SceneClass)
+    """Their class."""
 
-    scenes: tuple[int, ...] = (12000,)
-    """Scenes drawn in each class; the usable ones are kept."""
+    scenes: int = 12000
+    """Scenes drawn; the usable ones are kept."""
 
     refine_points: int = 3
     """Embedded point iterations of the portfolio."""
 
     problems: tuple[str, ...] = ()
-    """Real problems, from which classes of the family `windows` are cut."""
+    """Real problems, from which scenes of the family `windows` are cut."""
 
     intrinsics: Intrinsics = "free"
     """Whether focal lengths and distortions are optimised in the game's solves."""
@@ -112,13 +112,10 @@ class BankConfig:
         return StepOptions(refinement=Refinement(points=self.refine_points), intrinsics=self.intrinsics)
 
     def __post_init__(self) -> None:
-        if len(self.classes) != len(self.scenes) or not self.classes:
-            raise ValueError(f"{len(self.classes)} classes of scenes but {len(self.scenes)} numbers of scenes")
         check_count("refine_points", self.refine_points, 0)
-        if min(self.scenes) < 1:
-            raise ValueError("every class needs at least one scene")
-        if bool(self.problems) != any(kind.family == "windows" for kind in self.classes):
-            raise ValueError("problems and classes of the family windows go together: only one of them is given")
+        check_count("scenes", self.scenes, 1)
+        if bool(self.problems) != (self.kind.family == "windows"):
+            raise ValueError("problems and scenes of the family windows go together: only one of them is given")
         _ = self.options  # raises ValueError if impossible
 
 
@@ -168,7 +165,7 @@ class Split(NamedTuple):
 
 
 @for_traces
-def make_banks(
+def make_split(
     config: BankConfig,
     key: Array,
     options: StepOptions,
@@ -176,36 +173,28 @@ def make_banks(
     report: Callable[[str], None] = lambda _: None,
     tolerance: float = 1e-3,
     problems: Sequence[StrPath | BundleProblem] = (),
-) -> list[Split]:
-    """Draws and solves scenes of every class, and splits the usable ones. The same key gives the same banks. `options`
-    are those of the portfolio's steps, `limit` is that of an episode; `report` is called with a line when something
-    long begins. The game's tolerance does not change which are usable. Windows are cut from `problems`, in memory or
-    files, instead of those that `config` names. Raises InputError: no scene of a class would be left to train on."""
-    splits = []
-    for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
-        where = _shape(kind)
-        on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
-        class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
-        solved = lambda scenes, on_rule=on_rule, kind=kind: solve_scenes(
-            kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance
-        )
-        if kind.family == "windows":
-            seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))
-            parts = read_windows(problems or config.problems, kind, count, seed)
-            banks = [select(*solved(scenes)) for scenes in parts]
-        else:
-            made, usable = solved(make_scenes(kind, class_key, count))
-            rows = np.flatnonzero(usable)
-            held = held_out_count(len(rows))
-            banks = [select(made, part) for part in (rows[held:], rows[:held])]
-        if any(not len(bank.initial_cost) for bank in banks):
-            usable = sum(len(bank.initial_cost) for bank in banks)
-            raise InputError(f"only {usable} of {count} scenes of {where} are usable: draw more")
-        splits.append(Split(*banks))
-    return splits
+) -> Split:
+    """Draws and solves scenes, and splits the usable ones. The same key gives the same scenes. `options` are those of
+    the portfolio's steps, `limit` is that of an episode; `report` is called with a line when something long begins. The
+    game's tolerance does not change which are usable. Windows are cut from `problems`, in memory or files, instead of
+    those that `config` names. Raises InputError: no scene would be left to train on."""
+    kind, count, key = config.kind, config.scenes, jax.random.fold_in(key, 0)
+    where = _shape(kind)
+    on_rule = lambda rule: report(f"{count} scenes of {where}: {rule}")
+    solved = lambda scenes: solve_scenes(kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance)
+    if kind.family == "windows":
+        seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
+        banks = [select(*solved(scenes)) for scenes in read_windows(problems or config.problems, kind, count, seed)]
+    else:
+        made, usable = solved(make_scenes(kind, key, count))
+        rows = np.flatnonzero(usable)
+        held = held_out_count(len(rows))
+        banks = [select(made, part) for part in (rows[held:], rows[:held])]
+    if any(not len(bank.initial_cost) for bank in banks):
+        usable = sum(len(bank.initial_cost) for bank in banks)
+        raise InputError(f"only {usable} of {count} scenes of {where} are usable: draw more")
+    return Split(*banks)
 
-
-MORE_CLASSES = 2**30  # offset of the random streams of classes but the first from the agents', from 1 on (driver.py)
 
 HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
 """Fraction of usable scenes held out; more up to a number whose mean says something, at most the last one."""

@@ -54,7 +54,7 @@ REDUCTION = replace(OURS, name="agent-reduction", overrides=("game.reward=reduct
 CLOCK = replace(OURS, name="agent-clock", overrides=BY_THE_CLOCK)
 REVERSED = replace(OURS, name="agent-reversed", overrides=("game.reward=reversed", "game.agent.observation=duration"))
 
-WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[200]", "bank.refine_points=3")
+WINDOWS = ("bank.kind={cameras: 10, points: 40}", "bank.scenes=200", "bank.refine_points=3")
 """Windows of agents for real problems. With ten points, most cameras would have too few observations."""
 
 
@@ -120,8 +120,8 @@ def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Calla
     if not path.is_file():
         report(f"{agent.name}: best constant action")
         work, played = game_of(config, agent, folder, report)
-        banks = task.first_scenes(played.banks, work.held_out)
-        found = best_constant_action(played.kinds, banks, played.config, played.options)
+        bank = task.first_scenes(played.bank, work.held_out)
+        found = best_constant_action(played.kind, bank, played.config, played.options)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_policy(path, always(found.action[0], found.config))
     return path
@@ -160,7 +160,7 @@ def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Ban
     """The game in which an agent is trained."""
     if agent.few_scenes:
         train_on = select(train_on, np.arange(min(config.agents.trajectories, len(train_on.initial_cost))))
-    return make_game(settings.game, settings.bank.classes, [train_on], settings.envs, settings.step_options)
+    return make_game(settings.game, settings.bank.kind, train_on, settings.envs, settings.step_options)
 
 
 def _shared_scenes(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> Split:
@@ -169,7 +169,7 @@ def _shared_scenes(config: PaperConfig, agent: Agent, folder: Path, report: Call
     if not all((shared / name).is_file() for name in (task.BANK, task.RULES)):
         shared.mkdir(parents=True, exist_ok=True)
         task.build(train_config(config, agent if agent.problems else OURS), shared, report, BASELINES)
-    return task.read_banks(shared / task.BANK)[0]
+    return task.read_split(shared / task.BANK)
 
 
 def _scenes_folder(agent: Agent, folder: Path) -> Path:

@@ -176,7 +176,7 @@ class Runner:
             bank = self.test_scenes
             self.report(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
             started = time.perf_counter()
-            found = play(settings.bank.classes[0], bank, policy, options, LIMIT)
+            found = play(settings.bank.kind, bank, policy, options, LIMIT)
             best = np.asarray(bank.best_cost)
             first = [row[: min(SCHEDULE, count)] for row, count in zip(found.dampings, found.iterations, strict=True)]
             self.store.add_play(

@@ -84,7 +84,7 @@ def slope_of_next_cost(
     the action, the episode after the step, and the step."""
 
     def play(action: Array) -> tuple[Array, tuple[Episode, StepInfo]]:
-        after, step = game.iterate(game.kinds[0], game.banks[0], episode, action[None])
+        after, step = game.iterate(game.bank, episode, action[None])
         return jnp.log10(step.candidate_cost / step.previous_cost), (after, step)
 
     action = action.astype(episode.state.cost.dtype)
@@ -93,7 +93,7 @@ def slope_of_next_cost(
 
 
 def train(config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array) -> tuple[ZeroNet, np.ndarray]:
-    """Trains a network on the scenes of the first bank of a game, whose rewards are not used. `config` has the sizes of
+    """Trains a network on the scenes of a game, whose rewards are not used. `config` has the sizes of
     the network and of the training, `agent` the length of the history and the range of lambda. Returns the network, and
     for each update the mean of log10(next cost / current cost)."""
     start, play = jax.random.split(key)
@@ -107,7 +107,7 @@ def _train(
     config: ZeroNetConfig, game: Game, net: ZeroNet, key: Array
 ) -> tuple[tuple[Layer, ...], Float[Array, " updates"]]:
     adam = optax.adam(config.learning_rate)
-    bank: Bank = game.banks[0]
+    bank: Bank = game.bank
 
     def another(key: Array) -> Episode:
         scene = jax.random.randint(key, (), 0, bank.initial_cost.shape[0], jnp.int32)

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxba.damping.learned import LearnedPolicy
 from jaxba.game.env import Game, Reward, RewardFunction, make_game
-from jaxba.game.scene_bank import Bank, make_banks
+from jaxba.game.scene_bank import Bank, make_split
 from jaxba.io.files import StrPath
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
@@ -34,8 +34,8 @@ EVALUATIONS = 10  # evaluations of a training, after equal parts of it
 class PresetGame(Game):
     """A game with the settings that an agent is trained with."""
 
-    held_out: tuple[Bank, ...] = ()  # scenes that no training sees, a bank per class
-    preset: TrainConfig = field(default_factory=TrainConfig, metadata={"static": True})  # everything else
+    held_out: Bank  # scenes that no training sees
+    preset: TrainConfig = field(metadata={"static": True})  # everything else
 
 
 def make_env(
@@ -72,10 +72,9 @@ def make_env(
     config = replace(config, game=rules)
     with numerics(np.float64), process.single_blas_thread():
         key, limit = jax.random.key(config.seed), rules.max_iterations
-        splits = make_banks(config.bank, key, config.bank.options, limit, report, rules.tolerance, problems)
-        game = make_game(rules, config.bank.classes, [x.train for x in splits], config.envs, config.step_options)
-    held_out = tuple(split.held_out for split in splits)
-    return PresetGame(*(getattr(game, name) for name in vars(game)), held_out=held_out, preset=config)
+        split = make_split(config.bank, key, config.bank.options, limit, report, rules.tolerance, problems)
+        game = make_game(rules, config.bank.kind, split.train, config.envs, config.step_options)
+    return PresetGame(*(getattr(game, name) for name in vars(game)), held_out=split.held_out, preset=config)
 
 
 def train(
@@ -128,7 +127,7 @@ def gym_env(preset: str = "paper", overrides: Sequence[str] = (), **settings: An
     """What `gymnasium.make("jaxba/BundleAdjustment-v0")` makes: one scene at a time. Arguments as for `make_env`."""
     from jaxba.game.gym import GymGame
 
-    return GymGame(make_env(preset, *overrides, "envs=[1]", **settings))
+    return GymGame(make_env(preset, *overrides, "envs=1", **settings))
 
 
 def gym_vector_env(
@@ -137,4 +136,4 @@ def gym_vector_env(
     """The same for `gymnasium.make_vec`: many scenes in one compiled program."""
     from jaxba.game.gym import GymVectorGame
 
-    return GymVectorGame(make_env(preset, *overrides, f"envs=[{num_envs}]", **settings))
+    return GymVectorGame(make_env(preset, *overrides, f"envs={num_envs}", **settings))

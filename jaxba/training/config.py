@@ -48,8 +48,8 @@ class TrainConfig:
     checkpoint_every: int = 4
     """Chunks between checkpoints, of which the last two are kept. Each also holds the best policy so far."""
 
-    envs: tuple[int, ...] = (64,)
-    """Environments of each class of scenes."""
+    envs: int = 64
+    """Environments that step together."""
 
     method: MethodName = "lm"
     """How a step is computed (jaxba/solver/methods.py). Scenes are solved and selected with plain LM."""
@@ -75,7 +75,7 @@ class TrainConfig:
         """Options of the method's steps, without embedded iterations."""
         plain = StepOptions(self.linear_solver, intrinsics=self.bank.intrinsics)
         if self.linear_solver == "cg":
-            unknowns = (9 if self.bank.intrinsics == "free" else 6) * max(kind.cameras for kind in self.bank.classes)
+            unknowns = (9 if self.bank.intrinsics == "free" else 6) * self.bank.kind.cameras
             rule = ConjugateGradients("schur-jacobi", forcing=0.0, budget=CG_ROUNDS * unknowns)
             plain = replace(plain, conjugate_gradients=rule)
         method = make_method(self.method)
@@ -84,16 +84,12 @@ class TrainConfig:
         return method.options(plain)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every"):
+        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "envs"):
             check_count(name, getattr(self, name), 1)
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 to 2147483647, not {self.seed}")
-        if len(self.envs) != len(self.bank.classes):
-            raise ValueError(f"envs: {len(self.envs)} numbers for {len(self.bank.classes)} classes of scenes")
-        if min(self.envs) < 1:
-            raise ValueError(f"envs: every class needs at least one environment, not {min(self.envs)}")
-        if sum(self.envs) > self.loop.replay_capacity:
-            raise ValueError(f"loop.replay_capacity must be at least the {sum(self.envs)} environments")
+        if self.envs > self.loop.replay_capacity:
+            raise ValueError(f"loop.replay_capacity must be at least the {self.envs} environments")
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
         _ = self.step_options  # raises ValueError if impossible
@@ -147,8 +143,6 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
 
 
 def with_problems(config: TrainConfig, problems: Sequence[str]) -> TrainConfig:
-    """The configuration with windows of real problems for scenes: of its classes of the family `windows`, or of all."""
-    classes = config.bank.classes
-    if not any(kind.family == "windows" for kind in classes):
-        classes = tuple(replace(kind, family="windows") for kind in classes)
-    return replace(config, bank=replace(config.bank, problems=tuple(problems), classes=classes))
+    """The configuration with windows of real problems for scenes."""
+    kind = replace(config.bank.kind, family="windows")
+    return replace(config, bank=replace(config.bank, problems=tuple(problems), kind=kind))

@@ -17,9 +17,9 @@ from jaxba.damping import DampingPolicy, make_policy
 from jaxba.damping.learned import LearnedPolicy, boldest, learned_from
 from jaxba.damping.registry import BOLD, LEARNED
 from jaxba.game.env import Game, make_game
-from jaxba.game.evaluate import Runs, Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
+from jaxba.game.evaluate import Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
 from jaxba.game.rollout import Trajectories
-from jaxba.game.scene_bank import Bank, Split, make_banks, select
+from jaxba.game.scene_bank import Bank, Split, make_split, select
 from jaxba.game.statistics import paired_ratio
 from jaxba.problem.options import StepOptions
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
@@ -49,8 +49,8 @@ class Task:
 
     config: TrainConfig  # of the run
     game: Game  # to train on
-    held_out: tuple[Bank, ...]  # scenes that training never sees, a bank per class
-    baseline_runs: dict[str, Runs]  # what the baselines did on the held-out scenes
+    held_out: Bank  # scenes that training never sees
+    baseline_runs: dict[str, Trajectories]  # what the baselines did on the held-out scenes
 
     @cached_property
     def rules(self) -> dict[str, Score]:
@@ -63,18 +63,18 @@ class Task:
         return learned_from(self.config.game.agent, actor)
 
     @cached_property
-    def chosen_on(self) -> tuple[Bank, ...]:
+    def chosen_on(self) -> Bank:
         """Training scenes by which policies are chosen (`first_scenes`)."""
-        return first_scenes(self.game.banks, self.held_out)
+        return first_scenes(self.game.bank, self.held_out)
 
     def evaluate(self, actor: Any) -> dict[str, float]:
         """Scores of a policy by their names in the log. `training/score` chooses among policies: on training scenes,
         the mean number of iterations, the limit for a failure. Those on held-out scenes are for the eye alone."""
         rules = self.config.game
         found = {}
-        for name, banks in (("training", self.chosen_on), ("held_out", self.held_out)):
+        for name, bank in (("training", self.chosen_on), ("held_out", self.held_out)):
             arguments = self.policy(actor), self.game.options, rules.tolerance, rules.max_iterations
-            scored = evaluate(self.config.bank.classes, banks, *arguments)
+            scored = evaluate(self.game.kind, bank, *arguments)
             fields = scored._asdict()
             found |= {f"{name}/score": fields.pop("mean")} | {f"{name}/{field}": x for field, x in fields.items()}
         return found
@@ -84,7 +84,7 @@ class Task:
         tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
         names = [f"{TRAINED} {k + 1}" for k in range(len(actors))]
         steps = {name: (self.policy(actor), self.game.options) for name, actor in zip(names, actors, strict=True)}
-        alone = play_all(self.config.bank.classes, self.held_out, steps, limit)
+        alone = play_all(self.game.kind, self.held_out, steps, limit)
         best = best_costs({**alone, **self.baseline_runs}, self.held_out)
         found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
         each = {name: found.pop(name) for name in names}
@@ -98,12 +98,9 @@ class Task:
         return {**(each if len(actors) > 1 else {}), TRAINED: mean, **found}, ratios, by_agent
 
 
-def first_scenes(training: Sequence[Bank], held_out: Sequence[Bank]) -> tuple[Bank, ...]:
-    """The first scenes of the training banks, as many of each as are held out."""
-    count = lambda bank: len(bank.initial_cost)
-    return tuple(
-        select(bank, np.arange(min(count(bank), count(other)))) for bank, other in zip(training, held_out, strict=True)
-    )
+def first_scenes(training: Bank, held_out: Bank) -> Bank:
+    """The first scenes of the training bank, as many as are held out."""
+    return select(training, np.arange(min(len(training.initial_cost), len(held_out.initial_cost))))
 
 
 def build(
@@ -120,27 +117,25 @@ def build(
     path = folder / BANK
     if path.is_file():
         report("reading the scenes")
-        splits = read_banks(path)
+        split = read_split(path)
     else:
         key, limit = jax.random.key(config.seed), config.game.max_iterations
-        splits = make_banks(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
-        _write_banks(path, splits)
-    banks = [split.train for split in splits]
-    game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
-    held_out = tuple(split.held_out for split in splits)
+        split = make_split(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
+        _write_split(path, split)
+    game = make_game(config.game, config.bank.kind, split.train, config.envs, config.step_options)
     on_game(game)
-    runs = _baseline_runs(config, folder, game, held_out, report, baselines)
-    return Task(config, game, held_out, runs)
+    runs = _baseline_runs(config, folder, game, split.held_out, report, baselines)
+    return Task(config, game, split.held_out, runs)
 
 
 def _baseline_runs(
     config: TrainConfig,
     folder: Path,
     game: Game,
-    held_out: tuple[Bank, ...],
+    held_out: Bank,
     report: Callable[[str], None],
     baselines: Sequence[str] | None,
-) -> dict[str, Runs]:
+) -> dict[str, Trajectories]:
     path = folder / RULES
     if path.is_file():
         return _read_runs(path)
@@ -148,12 +143,12 @@ def _baseline_runs(
     names = list(baselines or BASELINES)
     policies = baseline_policies(config, game.options, [name for name in names if name != CONSTANT])
     if CONSTANT in names:
-        banks = first_scenes(game.banks, held_out)
-        found = best_constant_action(config.bank.classes, banks, config.game, game.options, policies)
+        bank = first_scenes(game.bank, held_out)
+        found = best_constant_action(game.kind, bank, config.game, game.options, policies)
         policies[CONSTANT] = found, game.options
-    runs = play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
-    banks = ((f"{name}/{k}", run) for name, played in runs.items() for k, run in enumerate(played))  # as in the table
-    checkpoint.write_arrays(path, {f"{at}/{field}": x for at, run in banks for field, x in run._asdict().items()})
+    runs = play_all(game.kind, held_out, policies, config.game.max_iterations)  # in the order of the table
+    arrays = {f"{name}/{field}": x for name, run in runs.items() for field, x in run._asdict().items()}
+    checkpoint.write_arrays(path, arrays)
     return runs
 
 
@@ -167,24 +162,19 @@ def baseline_policies(
     return found | ({BOLD: (boldest(config.game.agent), options)} if BOLD in found else {})
 
 
-def _write_banks(path: Path, splits: list[Split]) -> None:
-    checkpoint.write_arrays(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()})
+def _write_split(path: Path, split: Split) -> None:
+    checkpoint.write_arrays(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(split).items()})
 
 
-def read_banks(path: Path) -> list[Split]:
+def read_split(path: Path) -> Split:
     """The scenes of a run's folder. Raises TrainError: another version wrote them, or the file is damaged."""
-    arrays = _read(path)
-    classes = dict.fromkeys(name.partition("/")[0] for name in arrays)
-    return [_named_tuple(path, Split, f"{number}/", arrays) for number in classes]
+    return _named_tuple(path, Split, "", _read(path))
 
 
-def _read_runs(path: Path) -> dict[str, Runs]:
+def _read_runs(path: Path) -> dict[str, Trajectories]:
     arrays = _read(path)
-    found: dict[str, Runs] = {}
-    for bank in dict.fromkeys(name.rpartition("/")[0] for name in arrays):
-        run = _named_tuple(path, Trajectories, f"{bank}/", arrays, np.asarray)
-        found.setdefault(bank.rpartition("/")[0], []).append(run)
-    return found
+    names = dict.fromkeys(name.rpartition("/")[0] for name in arrays)
+    return {name: _named_tuple(path, Trajectories, f"{name}/", arrays, np.asarray) for name in names}
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:

@@ -26,17 +26,17 @@ ACTIONS = np.array([[-0.8], [0.0], [0.6]])
 
 @pytest.fixture(scope="module")
 def game():
-    return make_game(replace(RULES, agent=CONFIG, max_iterations=25), [KIND], [tiny_bank()], [4])
+    return make_game(replace(RULES, agent=CONFIG, max_iterations=25), KIND, tiny_bank(), 4)
 
 
 @pytest.fixture(scope="module")
 def alone(game):
     """Iterations and success of the base policy's own episodes."""
-    return look_ahead(game, POLICY, ACTIONS, looks=False)[0]
+    return look_ahead(game, POLICY, ACTIONS, looks=False)
 
 
 def test_the_base_policy_takes_the_iterations_that_it_takes_in_an_evaluation(game, alone):
-    (bank,), rules = game.banks, game.config
+    bank, rules = game.bank, game.config
     run = play(KIND, bank, POLICY, CONFIG.step_options(StepOptions()), rules.max_iterations, ftol=0.0)
     reached = reach(run.costs[:, 1:], np.asarray(bank.best_cost), rules.tolerance) + 1
     np.testing.assert_array_equal(alone[0], np.minimum(reached, rules.max_iterations))
@@ -44,7 +44,7 @@ def test_the_base_policy_takes_the_iterations_that_it_takes_in_an_evaluation(gam
 
 
 def test_it_takes_no_more_than_its_base_and_fewer_somewhere(game, alone):
-    ((iterations, success),) = look_ahead(game, POLICY, ACTIONS, looks=True)
+    iterations, success = look_ahead(game, POLICY, ACTIONS, looks=True)
     assert (iterations <= alone[0]).all()
     assert (iterations < alone[0]).any()
     assert (success >= alone[1]).all()
@@ -52,9 +52,7 @@ def test_it_takes_no_more_than_its_base_and_fewer_somewhere(game, alone):
 
 def test_its_first_numbers_are_those_of_the_whole_episodes(game, alone):
     """The base policy's own action leads to what it takes alone."""
-    (bank,) = game.banks
-    found = jax.jit(
-        lambda scene: play_on(game, KIND, bank, POLICY, jnp.asarray([POLICY.action]), game.start(bank, scene))
-    )
+    bank = game.bank
+    found = jax.jit(lambda scene: play_on(game, bank, POLICY, jnp.asarray([POLICY.action]), game.start(bank, scene)))
     for scene in range(3):
         assert found(jnp.asarray(scene, jnp.int32))[0] == alone[0][scene]

@@ -21,8 +21,8 @@ from jaxba.training.config import load
 from jaxba.typing import InputError
 
 TINY = [
-    *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=[8]"),
-    *("bank.classes=[{cameras: 4, points: 12, family: paper}]", "bank.scenes=[160]", "bank.refine_points=0"),
+    *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=8"),
+    *("bank.kind={cameras: 4, points: 12, family: paper}", "bank.scenes=160", "bank.refine_points=0"),
     "game.max_iterations=12",
     *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),
 ]
@@ -211,5 +211,5 @@ def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch)
     def none(*_args, **_kwargs):
         raise InputError("only 0 of 9 scenes are usable: draw more")
 
-    monkeypatch.setattr(task, "make_banks", none)
+    monkeypatch.setattr(task, "make_split", none)
     assert "draw more" in error_of(capsys, *COMMAND, "--out", str(tmp_path / "run"))

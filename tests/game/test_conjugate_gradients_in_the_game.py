@@ -20,7 +20,7 @@ SCENES = 64
 
 def test_a_vmapped_step_of_the_papers_scenes_is_that_of_dense_algebra():
     config = load("paper")
-    (kind,) = config.bank.classes
+    kind = config.bank.kind
     assert kind == SceneClass(10, 10, "paper")
     scenes = make_scenes(kind, jax.random.key(3), SCENES)
     costs = initial_costs(kind, scenes)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import same_bits
-from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
+from tiny_game import AGENT, RULES, tiny_bank, tiny_game
 
 from jaxba.damping.features import begin, duration, observation_size, observe
 from jaxba.damping.guard import damping_of
@@ -72,7 +72,7 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
     bank = tiny_bank()
     goals = limits = 0
     for k, (before, _, action, step) in enumerate(found):
-        (episodes,) = before.episodes
+        episodes = before.episodes
         best = np.asarray(bank.best_cost)[episodes.scene]
         cost = np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
         at_limit = episodes.memory.iteration + 1 >= RULES.max_iterations
@@ -87,23 +87,23 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
     assert limits >= 5
 
 
-@functools.partial(jax.jit, static_argnames=("game_rules", "kind"))
-def _iterate(game, kind, bank, episode, action, game_rules):
-    after, step = game.iterate(kind, bank, episode, action[None])
+@functools.partial(jax.jit, static_argnames=("game_rules",))
+def _iterate(game, bank, episode, action, game_rules):
+    after, step = game.iterate(bank, episode, action[None])
     return after, step
 
 
 def _alone(game: Game, episodes, action, e: int) -> float:
     episode = jax.tree.map(lambda x: jnp.asarray(x[e]), episodes)
-    return float(_iterate(game, KIND, game.banks[0], episode, jnp.asarray(action[e, 0]), game.config)[1].cost)
+    return float(_iterate(game, game.bank, episode, jnp.asarray(action[e, 0]), game.config)[1].cost)
 
 
 def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_is_the_true_one():
     game, found = random_game()
     starts = {}
     for scene in range(len(tiny_bank().initial_cost)):
-        episode = game.start(game.banks[0], jnp.asarray(scene, jnp.int32))
-        starts[np.asarray(game._observe(game.banks[0], episode)).tobytes()] = scene
+        episode = game.start(game.bank, jnp.asarray(scene, jnp.int32))
+        starts[np.asarray(game._observe(game.bank, episode)).tobytes()] = scene
     assert len(starts) > 10
     ended = 0
     for k, (before, _, action, step) in enumerate(found):
@@ -116,21 +116,21 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
             else:
                 np.testing.assert_array_equal(step.observation[e], step.final_observation[e])
             if k < 6:
-                episode = jax.tree.map(lambda x, e=e: jnp.asarray(x[e]), before.episodes[0])
-                after, _ = _iterate(game, KIND, game.banks[0], episode, jnp.asarray(action[e, 0]), game.config)
-                np.testing.assert_allclose(step.final_observation[e], game._observe(game.banks[0], after), atol=1e-5)
+                episode = jax.tree.map(lambda x, e=e: jnp.asarray(x[e]), before.episodes)
+                after, _ = _iterate(game, game.bank, episode, jnp.asarray(action[e, 0]), game.config)
+                np.testing.assert_allclose(step.final_observation[e], game._observe(game.bank, after), atol=1e-5)
                 np.testing.assert_allclose(step.final_observation[e, :-1], observe(AGENT, after.memory), atol=1e-5)
-                distance = after.state.cost / game.banks[0].best_cost[after.scene] - 1
+                distance = after.state.cost / game.bank.best_cost[after.scene] - 1
                 decades = np.log10(np.maximum(distance, 1e-6)) / 6
                 np.testing.assert_allclose(step.final_observation[e, -1], decades, atol=1e-4)
         if k + 1 < len(found):
-            (following,) = found[k + 1][0].episodes
+            following = found[k + 1][0].episodes
             assert (following.memory.iteration[done] == 0).all()
             np.testing.assert_array_equal(
                 following.state.cost[done], np.asarray(tiny_bank().initial_cost)[following.scene[done]]
             )
     assert ended >= 30
-    scenes = {int(s) for before, *_ in found for s in before.episodes[0].scene}
+    scenes = {int(s) for before, *_ in found for s in before.episodes.scene}
     assert len(scenes) > 10  # of the whole bank, not the same ones again
 
 
@@ -190,7 +190,7 @@ def test_the_game_pays_what_it_says():
     checked = 0
     for k in range(len(found) - 1):
         before, _, _, step = found[k]
-        (episodes,), (following,) = before.episodes, found[k + 1][0].episodes
+        episodes, following = before.episodes, found[k + 1][0].episodes
         for e in range(ENVS):
             success = bool(step.metrics["success"][e])
             best = float(np.asarray(tiny_bank().best_cost)[episodes.scene[e]])
@@ -211,7 +211,7 @@ def test_the_same_key_and_actions_give_the_same_numbers_and_the_game_is_traced_o
         chex.assert_trees_all_equal(again, step, strict=True)
     other, _ = _jitted_reset(game, jax.random.key(4))
     assert not same_bits(other.episodes, found[0][0].episodes)
-    _jitted_step(dataclasses.replace(game, banks=(_shifted(game.banks[0]),)), other, actions(1)[0])
+    _jitted_step(dataclasses.replace(game, bank=_shifted(game.bank)), other, actions(1)[0])
     assert _jitted_step._cache_size() == traced  # other scenes, same program
 
 
@@ -227,9 +227,7 @@ def test_demonstrations_are_actions_of_which_some_follow_ceres_rule():
     assert (np.abs(found) < 1).all()
     lambdas = [
         float(
-            damping_of(
-                AGENT, jax.tree.map(lambda x, e=e: x[e], state.episodes[0].memory.guard), jnp.asarray(found[e, 0])
-            )
+            damping_of(AGENT, jax.tree.map(lambda x, e=e: x[e], state.episodes.memory.guard), jnp.asarray(found[e, 0]))
         )
         for e in range(8)
     ]

@@ -31,7 +31,7 @@ def game():
 @pytest.fixture(scope="module")
 def single(game):
     """The same scenes, one at a time."""
-    return dataclasses.replace(game, envs=(1,))
+    return dataclasses.replace(game, num_envs=1)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from tiny_game import problem_of
 from jaxba import BundleProblem, ProblemError, StepOptions, random_scene, scene_like, write_problem
 from jaxba.game import windows
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.scene_bank import BankConfig, initial_costs, make_banks
+from jaxba.game.scene_bank import BankConfig, initial_costs, make_split
 from jaxba.game.windows import covisible, places, read_windows, window
 from jaxba.problem import geometry
 from jaxba.training import config as configs
@@ -97,24 +97,21 @@ def test_problems_that_have_no_windows_are_refused_in_one_line(make, message, mo
     assert "\n" not in str(found.value)
 
 
-def test_problems_without_classes_and_classes_without_problems_are_refused(file):
-    for classes, problems in (((KIND,), ()), ((SceneClass(),), (file,))):
+def test_problems_without_windows_and_windows_without_problems_are_refused(file):
+    for kind, problems in ((KIND, ()), (SceneClass(), (file,))):
         with pytest.raises(ValueError, match="go together"):
-            BankConfig(classes=classes, scenes=(10,), problems=problems)
+            BankConfig(kind=kind, scenes=10, problems=problems)
 
 
-def test_a_configuration_with_problems_has_windows_in_their_classes_or_in_all(file):
-    alone = configs.with_problems(configs.load("default"), [file])
-    assert [kind.family for kind in alone.bank.classes] == ["windows"]
-    classes = "bank.classes=[{cameras: 4, points: 12}, {cameras: 6, points: 20, family: windows}]"
-    mixed = configs.load("default", [classes, "bank.scenes=[50, 50]", "envs=[8, 8]", f"bank.problems=[{file}]"])
-    assert [kind.family for kind in configs.with_problems(mixed, [file]).bank.classes] == ["wide", "windows"]
+def test_a_configuration_with_problems_has_windows(file):
+    found = configs.with_problems(configs.load("default", ["bank.kind.points=20"]), [file])
+    assert (found.bank.kind, found.bank.problems) == (SceneClass(10, 20, "windows"), (file,))
 
 
 @pytest.mark.slow
 def test_a_bank_of_windows_has_best_costs_and_held_out_windows(file):
-    config = BankConfig(classes=(KIND,), scenes=(40,), problems=(file,), refine_points=1)
-    (split,) = make_banks(config, jax.random.key(0), StepOptions(), 40)
+    config = BankConfig(kind=KIND, scenes=40, problems=(file,), refine_points=1)
+    split = make_split(config, jax.random.key(0), StepOptions(), 40)
     for bank in split:
         assert len(bank.best_cost) > 0
         assert (bank.best_cost < bank.initial_cost).all()

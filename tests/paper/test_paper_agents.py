@@ -9,7 +9,7 @@ from support import paper, solve
 
 from jaxba import StepOptions, settings
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, held_out_count, make_banks
+from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, held_out_count, make_split
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
 from jaxba.paper.tables_and_figures.figures import small_scene
@@ -48,7 +48,7 @@ def test_ours_is_the_papers_agent():
     assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "constant")
     assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (10.0, 500, "value", 256)
     assert (found.sac.layers, found.sac.policy_layers) == (2, 3)  # and a linear one: three and four fully connected
-    assert found.bank.classes == (SceneClass(10, 10, "paper"),)
+    assert found.bank.kind == SceneClass(10, 10, "paper")
     assert found.bank.intrinsics == "fixed"
     assert found.game.max_iterations == 100
 
@@ -56,10 +56,10 @@ def test_ours_is_the_papers_agent():
 @pytest.fixture(scope="module")
 def split() -> Split:
     kind = SceneClass(4, 12, "paper")
-    made = BankConfig(classes=(kind,), scenes=(60,), refine_points=0, intrinsics="fixed")
+    made = BankConfig(kind=kind, scenes=60, refine_points=0, intrinsics="fixed")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxba.game.scene_bank.PORTFOLIO", ("ceres",))
-        return make_banks(made, jax.random.key(0), made.options, 40)[0]
+        return make_split(made, jax.random.key(0), made.options, 40)
 
 
 @pytest.mark.slow
@@ -100,10 +100,10 @@ def test_the_agent_with_few_scenes_trains_on_the_first_ones(split):
     few = PaperConfig(agents=AgentsConfig(trajectories=3))
     wanted = agents.train_config(few, agents.FEW)
     game = agents.game(few, agents.FEW, wanted, split.train)
-    np.testing.assert_array_equal(game.banks[0].initial_cost, split.train.initial_cost[:3])
+    np.testing.assert_array_equal(game.bank.initial_cost, split.train.initial_cost[:3])
     assert game.options == StepOptions(intrinsics="fixed")
     whole = agents.game(few, agents.OURS, wanted, split.train)
-    assert len(whole.banks[0].initial_cost) == len(split.train.initial_cost)
+    assert len(whole.bank.initial_cost) == len(split.train.initial_cost)
 
 
 def test_a_fixed_lens_is_bitwise_unchanged_and_poses_change():

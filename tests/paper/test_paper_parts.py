@@ -405,7 +405,7 @@ def test_an_agent_is_trained_on_other_problems_than_those_it_is_judged_on(monkey
     assert judged_on_b.problems == (path("a-30"), path("a-40"))
     assert judged_on_a.name != judged_on_b.name
     found = agents.train_config(settings, judged_on_a)
-    assert (found.bank.problems, found.bank.classes[0].family) == ((path("b-50"),), "windows")
+    assert (found.bank.problems, found.bank.kind.family) == ((path("b-50"),), "windows")
     assert (found.method, found.bank.intrinsics) == ("stba", "free")  # with the steps that it drives, on their unknowns
     kitti = agents.trained_elsewhere(settings, part, agents.PRINTED)
     assert kitti

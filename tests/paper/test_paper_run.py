@@ -21,9 +21,9 @@ agents:
     - chunks=1
     - evaluate_every=1
     - checkpoint_every=1
-    - envs=[8]
-    - "bank.classes=[{cameras: 4, points: 12, family: paper}]"
-    - bank.scenes=[160]
+    - envs=8
+    - "bank.kind={cameras: 4, points: 12, family: paper}"
+    - bank.scenes=160
     - bank.refine_points=0
     - game.max_iterations=100
     - sac.width=8

@@ -39,7 +39,7 @@ def start(scene: int):
     return game().start(tiny_bank(), jnp.asarray(scene, jnp.int32))
 
 
-_iterate = jax.jit(lambda episode, action: game().iterate(game().kinds[0], game().banks[0], episode, action[None]))
+_iterate = jax.jit(lambda episode, action: game().iterate(game().bank, episode, action[None]))
 _slope = jax.jit(lambda episode, action: zero_net.slope_of_next_cost(game(), episode, action))
 
 

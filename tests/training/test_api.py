@@ -18,7 +18,7 @@ from jaxba.training.checkpoint import TrainError
 from jaxba.typing import InputError
 
 SMALL = (
-    *("bank.classes=[{cameras: 5, points: 12}]", "bank.scenes=[80]", "envs=[4]", "game.max_iterations=6"),
+    *("bank.kind={cameras: 5, points: 12}", "bank.scenes=80", "envs=4", "game.max_iterations=6"),
     *("sac.width=16", "sac.batch=16", "loop.warmup_steps=16", "loop.replay_capacity=200"),
 )
 
@@ -41,8 +41,7 @@ def test_two_lines_train_a_policy_and_the_same_lines_the_same_one(env):
     for one, other in zip(policy.layers, again.layers, strict=True):
         np.testing.assert_array_equal(one.kernel, other.kernel)
     assert policy.config == env.config.agent
-    (bank,), (kind,) = env.held_out, env.kinds
-    run = play(kind, bank, policy, env.options, 6)
+    run = play(env.kind, env.held_out, policy, env.options, 6)
     assert np.isfinite(run.costs).all()
     assert (run.costs[:, -1] <= run.costs[:, 0]).all()
 

@@ -68,7 +68,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
         log_std_min=-20.0,
         privileged=False,
     )
-    assert found.bank.classes == (SceneClass(10, 10, "paper"),)
+    assert found.bank.kind == SceneClass(10, 10, "paper")
     agent = found.game.agent
     assert (agent.observation, agent.guard, agent.refinement) == ("paper", "off", Refinement())
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
@@ -107,16 +107,15 @@ def test_overrides_are_yaml():
     found = load(
         "default",
         [
-            "bank.classes=[{cameras: 6, points: 20}, {cameras: 8, points: 30, family: wide}]",
-            "bank.scenes=[10, 20]",
-            "envs=[3, 4]",
+            "bank.kind={cameras: 8, points: 30, family: wide}",
+            "bank.scenes=10",
             "sac.target_entropy=null",
             "sac.learn_temperature=false",
             "sac.gamma=1",
         ],
     )
-    assert found.bank.classes == (SceneClass(6, 20), SceneClass(8, 30))
-    assert (found.envs, found.sac.target_entropy, found.sac.learn_temperature) == ((3, 4), None, False)
+    assert found.bank.kind == SceneClass(8, 30)
+    assert (found.bank.scenes, found.sac.target_entropy, found.sac.learn_temperature) == (10, None, False)
     assert isinstance(found.sac.gamma, float)
 
 
@@ -135,7 +134,7 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("zzz=1", "unknown key zzz; known: seed, seeds"),
         ("lop.updates_per_step=1", "did you mean loop"),
         ("seed.deep=1", "seed has no parts"),
-        ("bank.classes=[{camras: 6}]", "unknown key bank.classes[0].camras; did you mean cameras"),
+        ("bank.kind={camras: 6}", "unknown key bank.kind.camras; did you mean cameras"),
         ("sac=3", "sac must be a mapping, is 3"),
         ("sac.width=1.5", "sac.width must be a whole number, is 1.5"),
         ("sac.width=true", "sac.width must be a whole number, is True"),
@@ -144,16 +143,16 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("sac.gamma=much", "sac.gamma must be a number, is 'much'"),
         ("sac.layer_norm=1", "sac.layer_norm must be true or false, is 1"),
         ("method=64", "method must be one of lm, stba, deeplm, is 64"),
-        ("envs=64", "envs must be a list, is 64"),
-        ("envs=[a]", "envs[0] must be a whole number, is 'a'"),
+        ("envs=[64]", "envs must be a whole number, is [64]"),
+        ("bank.problems=a", "bank.problems must be a list, is 'a'"),
+        ("bank.problems=[1]", "bank.problems[0] must be text, is 1"),
         ("game.reward=fun", "game.reward must be one of constant, clock, reduction, reversed, is 'fun'"),
         ("sac.width=[", "not YAML"),
         ("sac.width", "must be key=value"),
         ("chunks=0", "chunks must be at least 1, is 0"),
         ("seed=-1", "seed must lie in"),
-        ("envs=[1, 2]", "envs: 2 numbers for 1 classes"),
-        ("envs=[0]", "at least one environment"),
-        ("envs=[10000000]", "loop.replay_capacity must be at least the 10000000 environments"),
+        ("envs=0", "envs must be at least 1"),
+        ("envs=10000000", "loop.replay_capacity must be at least the 10000000 environments"),
         ("loop.replay_capacity=0", "loop: replay_capacity must be at least 1"),
         ("game.agent.history=30", "game.agent: history must be 1 to 20"),
         ("loop.replay_capacity=3000000000", "loop: replay_capacity must be at most 2147483647"),

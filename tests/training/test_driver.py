@@ -339,7 +339,7 @@ def test_a_broken_checkpoint_is_refused_in_one_line(tmp_path):
         run(folder, resume=True)
 
 
-def test_banks_survive_their_file(tmp_path):
+def test_scenes_survive_their_file(tmp_path):
     def bank(count: int) -> Bank:
         number = jnp.arange(count, dtype=jnp.float64)
         scenes = Scenes(
@@ -349,21 +349,21 @@ def test_banks_survive_their_file(tmp_path):
         info = ProblemInfo(number, whole, whole, whole, number, number, whole)
         return Bank(scenes, number, 2 * number, info, number)
 
-    splits = [Split(bank(5), bank(2)), Split(bank(3), bank(1))]
-    task._write_banks(tmp_path / "bank.npz", splits)
-    found = task.read_banks(tmp_path / "bank.npz")
-    chex.assert_trees_all_equal(found, splits, strict=True)
+    split = Split(bank(5), bank(2))
+    task._write_split(tmp_path / "bank.npz", split)
+    found = task.read_split(tmp_path / "bank.npz")
+    chex.assert_trees_all_equal(found, split, strict=True)
     assert [path.name for path in tmp_path.iterdir()] == ["bank.npz"]
     with np.load(tmp_path / "bank.npz") as file:
         older = {name: file[name] for name in file.files if not name.endswith("best_cost")}
     np.savez(tmp_path / "older.npz", **older)
     message = r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in a new folder$"
     with pytest.raises(TrainError, match=message):
-        task.read_banks(tmp_path / "older.npz")
+        task.read_split(tmp_path / "older.npz")
     for damage in (b"", b"no bank", (tmp_path / "bank.npz").read_bytes()[:-100]):
         (tmp_path / "damaged.npz").write_bytes(damage)
         with pytest.raises(TrainError, match=r"^[^\n]*damaged.npz: damaged; begin in a new folder$"):
-            task.read_banks(tmp_path / "damaged.npz")
+            task.read_split(tmp_path / "damaged.npz")
 
 
 def test_the_log_is_json(whole):
