@@ -10,7 +10,7 @@ from typing import NoReturn
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.io.decimals import number, parse
+from jaxba.io.decimals import SMALL, number, parse
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
 
@@ -96,7 +96,7 @@ class Text:
             end = space.end() if space else len(self._text)
             text, self._at = self._text[self._at : end], end
             self._blocks, self._start = [(self._count, lines, text)], self._count
-            self.values, self._complaint = parse(text)
+            self.values, self._complaint = parse(text, large=self._count > 16 * SMALL)
             if self.values.size:
                 self._last = lines, text
             lines += int(np.count_nonzero(np.frombuffer(text, np.uint8) == ord("\n")))

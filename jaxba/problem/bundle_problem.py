@@ -195,7 +195,7 @@ class BundleProblem(ArrayRecord):
         if points is not None:
             index = np.searchsorted(points, found.point_index).astype(np.int32)
             found = replace(found, points=np.asarray(self.points)[points], point_index=index, labels=None)
-            found = replace(found, residuals=self.residuals.of(np.asarray(observations), points))
+            found = replace(found, residuals=self.residuals and self.residuals.of(np.asarray(observations), points))
         if cameras is None:
             return found
         return replace(

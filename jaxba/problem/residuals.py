@@ -186,8 +186,6 @@ class Residuals(ArrayRecord):
 
     def of(self, observations: Bool[np.ndarray, " n"], points: Int[np.ndarray, " kept"]) -> Residuals:
         """Those of some of the points, and in a problem that is laid out of some of the observations."""
-        if not self.rows:
-            return self
         place, found = np.where(observations, np.cumsum(observations) - 1, -1), []
         for rows in self.rows:
             if len(rows.observation):

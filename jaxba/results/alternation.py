@@ -51,9 +51,9 @@ def solve_and_retriangulate(
         watch: as for `solve`; iterations and seconds are counted over all solves.
         verbose: as for `solve`."""
     options = checked_options(options)
-    callback, compiling = shown(callback, verbose)
+    callback, waiting = shown(callback, verbose)
     away = set_aside(problem)
-    solves = Consecutive(policy, callback, watch, compiling)
+    solves = Consecutive(policy, callback, watch, waiting)
     run = lambda problem, limit: solves.solve(away, problem, replace(options, max_iterations=limit), problem)
     run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):

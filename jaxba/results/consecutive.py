@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import jax
@@ -15,6 +13,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.drivers import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions
+from jaxba.solver.progress import Waiting
 from jaxba.solver.solve import Solution, solve_without
 
 
@@ -29,9 +28,9 @@ class Consecutive:
         policy: str | DampingPolicy,
         callback: Callback | None,
         watch: Watch | None,
-        compiling: Callable[[], AbstractContextManager],
+        waiting: Waiting,
     ) -> None:
-        self._policy, self._callback, self._watch, self._compiling = policy, callback, watch, compiling
+        self._policy, self._callback, self._watch, self._waiting = policy, callback, watch, waiting
         self.done: list[Solution] = []
 
     @property
@@ -55,7 +54,7 @@ class Consecutive:
             return self.stopped
 
         seen = watch and (lambda record, now: watch(of_all(record), lambda: with_parameters(whole, now())))
-        hooks = {"callback": forward, "watch": seen, "compiling": self._compiling}
+        hooks = {"callback": forward, "watch": seen, "waiting": self._waiting}
         found = solve_without(away, problem, self._policy, options, **hooks)
         self.done.append(found)
         return found

@@ -93,8 +93,8 @@ def solve_graduated(
         raise ProblemError("the problem has no observations, of which wrong ones might be rejected")
     if not max_residual >= 0:
         raise ValueError(f"max_residual must not be negative, is {max_residual}")
-    callback, compiling = shown(callback, verbose)
-    solves = Consecutive(policy, callback, watch, compiling)
+    callback, waiting = shown(callback, verbose)
+    solves = Consecutive(policy, callback, watch, waiting)
     away = facing_away(problem)
     counted = ~np.isin(problem.camera_index, away)
     every = np.ones(problem.num_observations, bool)
@@ -115,7 +115,7 @@ def solve_graduated(
     seen = observed(problem.subset(kept))[1][:, None]
     found = found.replace(points=np.where(seen, found.points, problem.points))
     none = replace(options, max_iterations=0)
-    start = Consecutive(policy, None, None, compiling).solve(NO_CAMERAS, problem.subset(kept), none, problem)
+    start = Consecutive(policy, None, None, waiting).solve(NO_CAMERAS, problem.subset(kept), none, problem)
     last = solves.solve(NO_CAMERAS, found.subset(kept), none if solves.stopped else options, found)
     return replace(
         solves.total,

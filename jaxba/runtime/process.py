@@ -56,6 +56,17 @@ def keep_memory() -> bool:
     return all(mallopt(parameter, value) == 1 for parameter, value in settings)
 
 
+def memory() -> float:
+    """Bytes of memory that this process may use: of the machine, or of its control group; infinite if not known."""
+    try:
+        found = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return np.inf
+    with contextlib.suppress(OSError, ValueError):
+        found = min(found, float(Path("/sys/fs/cgroup/memory.max").read_text()))  # a word if there is no limit
+    return found
+
+
 def return_memory() -> None:
     """Gives the memory that was freed so far back to the system, where the C library is glibc."""
     with contextlib.suppress(OSError, AttributeError):

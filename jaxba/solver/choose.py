@@ -1,15 +1,13 @@
-"""Choice of the linear solver, and refusal of what a method does not support or a machine cannot hold.
+"""Choice of the linear solver, and refusal of what a method does not support or a machine cannot factor.
 
 The predicted time of an iteration is a sum of amounts of work (observations, pairs, cubes of unknowns, ...) times
 measured seconds per unit. Only ratios matter for the choice, and they differ little between machines."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxba.lm.method import check_plain
@@ -17,6 +15,7 @@ from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemErro
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.runtime import process
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_small_capacitance, is_dense
 from jaxba.structure.observation_order import ObservationOrder
@@ -58,10 +57,6 @@ factor."""
 
 MAX_BYTES = 4e9  # largest memory of a solver that `auto` may choose
 
-BYTES_PER_OBSERVATION = 1100.0
-"""Device memory of one implicit step in float64: arguments, results and temporaries; half of it in float32. Measured:
-1,072 on a scene of the size of Ladybug-1197."""
-
 BYTES_PER_PAIR = 16.0  # index arrays with padding; the products are computed in batches
 MATRICES_PER_BLOCK = 3  # numbers in memory per number of a block: its own, its partial sums and its sum
 MAX_COUNTED_PAIRS = 20_000_000  # most pairs for which blocks are counted, which takes less than a second
@@ -81,13 +76,10 @@ def choose_linear_solver(
     options: StepOptions,
     asked: LinearSolverChoice,
     observations: ObservationOrder | None = None,
-    devices: int = 1,
 ) -> StepOptions:
     """The step options with the linear solver that is asked for, `auto` or a name; methods have their own.
-    `observations` are the sorted ones of the problem, if they are known already, and `devices` is the number among
-    which they are divided. Raises ProblemError: a method is asked for that does not support the problem; or a step
-    needs more memory than the device or the machine has."""
-    _check_device_memory(len(problem.observations), devices)
+    `observations` are the sorted ones of the problem, if they are known already. Raises ProblemError: a method is asked
+    for that does not support the problem; or a factorisation needs more memory than the machine has."""
     lenses, rigs = problem.lenses, problem.rigs
     if options.method:
         shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
@@ -200,31 +192,9 @@ def _width(problem: BundleProblem) -> int:
     return own + extrinsics + sum(problem.residuals.sizes)
 
 
-def device_memory() -> float:
-    """Bytes of memory of the default device; infinite if it has none of its own."""
-    device = jax.local_devices()[0]
-    stats = (device.platform != "cpu" and device.memory_stats()) or {}
-    return float(stats.get("bytes_limit", 0)) or np.inf
-
-
-def _check_device_memory(observations: int, devices: int) -> None:
-    """Raises a `ProblemError` if the observations alone do not fit the memory of a GPU, whatever the linear solver."""
-    available = device_memory()
-    needed = 0.5 * BYTES_PER_OBSERVATION * observations / devices  # in float32
-    if needed > available:
-        raise ProblemError(
-            f"{observations} observations take {2 * needed / 1e9:.1f} GB of a device in float64 and "
-            f"{needed / 1e9:.1f} in float32, more than its {available / 1e9:.1f} GB: "
-            "divide them among more (--devices) or take the CPU (--device cpu)"
-        )
-
-
 def _check_memory(observations: ObservationOrder, width: int, rigs: bool) -> None:
     """Raises a `ProblemError` if a factorisation needs more memory than the machine has."""
-    try:
-        available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return
+    available = process.memory()
     most = _bytes_of_blocks(_most_pairs(observations), width)
     needed = most + DENSE_MATRICES * 8.0 * (width * observations.num_cameras) ** 2
     if needed > available:  # an upper bound: count blocks and look for a band

@@ -24,6 +24,7 @@ from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.diagnosis import explain_start
+from jaxba.solver.estimate import estimate
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import Placed, check_problem, placed
@@ -134,11 +135,13 @@ def set_up(
     capacity: Capacity | None = None,
     *,
     in_parts: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Setup:
     """`prepare` without the initial state. Arguments and errors as there.
 
     `away`: whose views are left out, if that is decided. `capacity`: to which sizes it is padded, if that is decided;
-    the layout then stays on the host. `in_parts`: whether a device may compute a large problem part by part."""
+    the layout then stays on the host. `in_parts`: whether a device may compute a large problem part by part. `tell`
+    is called with what a long solve takes, before it is laid out."""
     check_problem(problem)
     options = checked_options(options)
     if isinstance(policy, str):
@@ -165,8 +168,12 @@ def set_up(
             capacity = capacity_of(here, observations)
         if capacity:  # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up
             asked = "explicit"  # to the largest capacity it is never slow
-        step = choose_linear_solver(here, step, asked, observations, len(devices))
+        step = choose_linear_solver(here, step, asked, observations)
         parts = num_parts(here, step, len(devices)) if in_parts else 1
+        needs = estimate(here, step, observations=observations, devices=len(devices), in_parts=parts > 1)
+        needs.check(single=dtype == np.float32)
+        if tell and needs.is_long:
+            tell(str(needs))
         shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
         if parts > 1:
             process.return_memory()

@@ -2,20 +2,72 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 
 from jaxba.solver.drivers import Callback, IterationRecord
 
 COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
+LONG_ITERATION_S = 5.0  # of an iteration whose seconds are counted while it runs
 BEAT_S = 0.5  # compilation is announced after so long, and has a dot for each of these
 
 
-def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Callable[[], AbstractContextManager]]:
-    """A callback that prints a row and calls the one that is given, and the context of compilation."""
+class Waiting:
+    """What is shown of things that take time: nothing."""
+
+    def tell(self, text: str) -> None:
+        """Before a long solve: what it takes."""
+
+    def compiling(self) -> AbstractContextManager:
+        """The context in which programs compile."""
+        return nullcontext()
+
+    def iterating(self, iteration: int) -> AbstractContextManager:
+        """The context of an iteration, from 1."""
+        return nullcontext()
+
+
+SILENT = Waiting()
+
+
+class Printed(Waiting):
+    """A line of what a long solve takes, one that grows while programs compile and, on a terminal, one that counts the
+    seconds of a long iteration beside those of the last one."""
+
+    def __init__(self) -> None:
+        self._last_s = 0.0
+
+    def tell(self, text: str) -> None:
+        """See `Waiting`."""
+        print(text, flush=True)
+
+    def compiling(self) -> AbstractContextManager:
+        """See `Waiting`."""
+        return _compiling()
+
+    @contextmanager
+    def iterating(self, iteration: int) -> Iterator[None]:
+        """See `Waiting`."""
+        began, last = time.perf_counter(), self._last_s
+        of_last = f", the last one took {last:.0f}" if last else ""
+
+        def show(_: int) -> str:
+            seconds = time.perf_counter() - began
+            return f"\r{iteration:4d}  {seconds:.0f} s{of_last} " if seconds > LONG_ITERATION_S else ""
+
+        shown = _beating(show, end=lambda beats: "\r\033[K" if beats else "")
+        with shown if sys.stdout.isatty() else nullcontext():
+            yield
+        self._last_s = time.perf_counter() - began
+
+
+def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Waiting]:
+    """A callback that prints a row and calls the one that is given, and what is printed of things that take time."""
     if not verbose:
-        return callback, nullcontext
+        return callback, SILENT
     time_before = None
 
     def show(record: IterationRecord) -> bool | None:
@@ -26,7 +78,7 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Ca
         time_before = record.time_s
         return callback and callback(record)
 
-    return show, compiling
+    return show, Printed()
 
 
 def row(record: IterationRecord, time_before: float) -> str:
@@ -40,20 +92,27 @@ def row(record: IterationRecord, time_before: float) -> str:
     return cells if step.accepted else f"{cells}  rejected"
 
 
-@contextmanager
-def compiling() -> Iterator[None]:
+def _compiling() -> AbstractContextManager:
     """Prints a line that grows while what is inside takes its time."""
+    return _beating(lambda beat: "." if beat else "compiling ", end=lambda beats: "\n" * (beats > 0))
+
+
+@contextmanager
+def _beating(show: Callable[[int], str], end: Callable[[int], str]) -> Iterator[None]:
+    """Prints what `show` gives for the number of each beat while what is inside takes its time, then the end for how
+    many gave something."""
     done = threading.Event()
 
-    def grow() -> None:
-        text = "compiling "
+    def beat() -> None:
+        beats = 0
         with suppress(Exception):  # of standard output; the next row meets it, too
             while not done.wait(BEAT_S):
+                text = show(beats)
+                beats += bool(text)
                 print(text, end="", flush=True)
-                text = "."
-            print(end="\n" * (text == "."), flush=True)
+            print(end=end(beats), flush=True)
 
-    thread = threading.Thread(target=grow, daemon=True)
+    thread = threading.Thread(target=beat, daemon=True)
     thread.start()
     try:
         yield

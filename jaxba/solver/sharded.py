@@ -146,11 +146,14 @@ class Shards:
         given = self.layout, carry, policy, tolerances, limit
         if length:
             return _run(*given, **self.static, length=length)
-        if self._once is None:
-            self._once = _run.lower(*given, **self.static, length=0).compile()
-            if self.in_parts:
-                process.return_memory()  # of the compiler
-        return self._once(*given)
+        once = self._once = self._once or self._compiled(given)
+        return once(*given)
+
+    def _compiled(self, given: tuple[Any, ...]) -> Callable[..., tuple[Carry, StepInfo]]:
+        """The program of one iteration."""
+        found = _run.lower(*given, **self.static, length=0).compile()
+        process.return_memory()  # of the compiler
+        return found
 
 
 def _is_here(device: jax.Device) -> bool:

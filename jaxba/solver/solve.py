@@ -5,8 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +28,7 @@ from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices,
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
-from jaxba.solver.progress import shown
+from jaxba.solver.progress import SILENT, Waiting, shown
 from jaxba.solver.stepwise import Stepwise, iterations_before
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
@@ -196,8 +194,8 @@ def solve(
             the method does not support what the problem has (shared lenses, priors, rigs).
         RuntimeError: this process was forked from one in which JAX had started.
         TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`."""
-    callback, compiling = shown(callback, verbose)
-    hooks = {"callback": callback, "compiling": compiling}
+    callback, waiting = shown(callback, verbose)
+    hooks = {"callback": callback, "waiting": waiting}
     check_problem(problem)
     part = observed_part(problem)
     whole = functools.partial(part.whole, problem)
@@ -214,16 +212,16 @@ def solve_without(
     *,
     callback: Callback | None,
     watch: Watch | None,
-    compiling: Callable[[], AbstractContextManager] = nullcontext,
+    waiting: Waiting = SILENT,
 ) -> Solution:
-    """`solve` where it is known which images face away; None: it is not. Programs compile in `compiling`."""
+    """`solve` where it is known which images face away; None: it is not. `waiting` is told what takes time."""
     options = checked_options(options)
-    setup = set_up(problem, policy, options, away, in_parts=True)
+    setup = set_up(problem, policy, options, away, in_parts=True, tell=waiting.tell)
     alone = callback is None and watch is None
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
-        driver.compiling = compiling
-        with compiling():
+        driver.compiling = waiting.compiling
+        with waiting.compiling():
             state = driver.begin()
         setup.check_cost(state)
         initial_cost, compiled, watched, began = float(state.cost), driver.compile_s(), 0.0, time.perf_counter()
@@ -233,7 +231,8 @@ def solve_without(
         if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
             steps, end = driver.finish()
         while end == Termination.RUNNING and not isinstance(driver, Compiled):
-            step, end = driver.iterate()
+            with waiting.iterating(len(records) + 1):
+                step, end = driver.iterate()
             records.append(step)
             record = IterationRecord(len(records), elapsed(), step)
             looked = time.perf_counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -12,21 +13,16 @@ class Agreement:
     """Asked by name by the layout of one of several shards, with what it needs itself; knows what all of them need as
     far as it was found in the round before. `ALONE` is that of the only shard, which needs nothing more."""
 
-    def __init__(
-        self,
-        known: dict[str, Any] | None = None,
-        common: dict[str, Any] | None = None,
-        found: dict[str, Any] | None = None,
-        prefix: str = "",
-    ) -> None:
+    def __init__(self, known: dict[str, Any] | None, common: dict[str, Any]) -> None:
         """`known` was found in the round before, `common` is what the shards of this round have in common so far."""
-        self._known, self._prefix = known, prefix
-        self._common: dict[str, Any] = {} if common is None else common
-        self.found: dict[str, Any] = {} if found is None else found
+        self._known, self._common, self._prefix = known, common, ""
+        self.found: dict[str, Any] = {}
 
     def within(self, name: str) -> Agreement:
         """The same for a part, whose names begin with that of the part."""
-        return Agreement(self._known, self._common, self.found, f"{self._prefix}{name}.")
+        part = copy.copy(self)
+        part._prefix = f"{self._prefix}{name}."
+        return part
 
     def size(self, name: str, own: int) -> int:
         """The largest of a number in all shards."""
@@ -61,7 +57,7 @@ class Agreement:
         return self._known.get(self._prefix + name, own)
 
 
-ALONE = Agreement()
+ALONE = Agreement(None, {})
 
 
 def merged(found: list[dict[str, Any]], known: dict[str, Any]) -> dict[str, Any]:

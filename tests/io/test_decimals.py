@@ -11,11 +11,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxba.io import decimals
 from jaxba.io.decimals import number_lines, observation_lines, parse
 
 # What the documents of BAL and C's strtod call a decimal number, with Fortran's exponents
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eEdD][+-]?[0-9]+)?")
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@pytest.fixture(params=[0, decimals.SMALL], ids=["large", "small"], scope="module", autouse=True)
+def written_size(request):
+    """Both ways of writing, whatever the number of numbers."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(decimals, "SMALL", request.param)
+        yield
 
 
 def expected(text: str) -> tuple[list[float], str | None]:
@@ -32,9 +41,10 @@ def expected(text: str) -> tuple[list[float], str | None]:
 
 
 def assert_parsed(text: str) -> None:
-    values, complaint = parse(text.encode())
     good, wrong = expected(text)
-    assert (values.tobytes(), complaint) == (np.array(good, np.float64).tobytes(), wrong), text
+    for large in (False, True):
+        values, complaint = parse(text.encode(), large=large)
+        assert (values.tobytes(), complaint) == (np.array(good, np.float64).tobytes(), wrong), text
 
 
 @given(st.text(alphabet="0123456789+-.eEdDx_ \n\t", max_size=40))

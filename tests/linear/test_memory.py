@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxba import Refinement, StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
-from jaxba.solver.choose import BYTES_PER_OBSERVATION
+from jaxba.solver.estimate import BYTES_PER_OBSERVATION
 
 pytestmark = pytest.mark.xla
 

@@ -25,13 +25,39 @@ def test_a_verbose_solve_prints_a_row_for_every_iteration_and_calls_back(run, ca
 
 
 def test_compilation_is_announced_where_it_takes_time(capsys, monkeypatch):
-    with progress.compiling():
+    with progress.Printed().compiling():
         pass
     assert capsys.readouterr().out == ""
     monkeypatch.setattr(progress, "BEAT_S", 0.01)
-    with progress.compiling():
+    with progress.Printed().compiling():
         time.sleep(0.3)
     words, dots = capsys.readouterr().out.split(" ")
     assert words == "compiling"
     assert dots.startswith("..")
     assert dots.endswith("\n")
+
+
+def test_a_long_iteration_counts_its_seconds_on_a_terminal_beside_those_of_the_last_one(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "BEAT_S", 0.01)
+    monkeypatch.setattr(progress, "LONG_ITERATION_S", 0.05)
+    waiting = progress.Printed()
+    with waiting.iterating(1):
+        time.sleep(0.1)
+    assert capsys.readouterr().out == ""  # no terminal
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    with waiting.iterating(2):
+        time.sleep(0.2)
+    shown = capsys.readouterr().out
+    assert shown.startswith("\r   2  0 s, the last one took 0 ")
+    assert shown.endswith("\r\033[K")
+    with waiting.iterating(3):
+        pass
+    assert capsys.readouterr().out == ""
+
+
+def test_a_long_solve_says_what_it_takes_before_it_starts(capsys, monkeypatch):
+    monkeypatch.setattr("jaxba.solver.estimate.LONG_S", 0.0)
+    jaxba.solve(support.tiny(), options=jaxba.SolveOptions(max_iterations=1), verbose=True)
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith(f"{support.tiny().num_observations} observations: some ")
+    assert first.endswith(" s an iteration")
