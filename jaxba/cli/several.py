@@ -28,7 +28,18 @@ from jaxba.solver.solve import Solution
 COSTS = "costs.csv"  # name of the file of costs in the folder of solutions
 
 FOR_ONE = (
-    *("log", "survey", "covariance", "record", "view", "retriangulate", "reject", "processes", "distributed"),
+    *(
+        "log",
+        "survey",
+        "covariance",
+        "record",
+        "checkpoint",
+        "view",
+        "retriangulate",
+        "reject",
+        "processes",
+        "distributed",
+    ),
     *("devices", "recipes"),
 )
 """Options of a single problem."""

@@ -87,7 +87,7 @@ class Problem:
     such as k2; of rigs extrinsics, frames (their poses) and frame-rotations."""
 
     gauge: Gauge | None = None
-    """Fix position, orientation and scale. Default: free, or the gauge of --constraints."""
+    """Fix position, orientation and scale. Default: as in --constraints."""
 
     constraints: Annotated[str | None, "FILE"] = None
     """YAML file of constants, priors and gauge by the model's own names and ids."""
@@ -195,6 +195,9 @@ class Output:
     nerfstudio; -: standard output. An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem
     is one, but for these endings, .txt, .bal, .bz2, .gz and .xz. Of several problems: a folder."""
 
+    checkpoint: Annotated[str | None, "FILE"] = None
+    """Written once a minute; the same command goes on from it."""
+
     resume: bool = False
     """Go on with several problems where it ended."""
 
@@ -205,7 +208,7 @@ class Output:
     """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge or priors."""
 
     record: Annotated[str | None, "FILE"] = None
-    """Parameters after every step (.npz), for jaxba-view. At most 20,000 points are recorded, evenly sampled."""
+    """Parameters after every step (.npz), for jaxba-view."""
 
     view: bool = False
     """Watch the solve in the browser (extra view)."""
@@ -345,6 +348,7 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     common.require(not (args.reject and args.retriangulate), "--reject and --retriangulate exclude each other")
     _check_recipes(args)
+    _check_checkpoint(args)
     problems = [name for name in (args.problem, *args.more) if name]
     if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
         from jaxba.cli import several
@@ -471,6 +475,13 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss, points: int
     common.print_line(f"wrote {path}")
 
 
+def _check_checkpoint(args: Arguments) -> None:
+    """Raises UsageError: a checkpoint of more than one solve."""
+    names = ("recipes", "retriangulate", "reject", "resume", "processes", "distributed")
+    several = [f"--{name}" for name in names if getattr(args, name)] + ["several problems"] * bool(args.more)
+    common.require(not (args.checkpoint and several), f"--checkpoint is for one solve, not for {', '.join(several)}")
+
+
 def _check_recipes(args: Arguments) -> None:
     """Raises UsageError: a wrong number of recipes, or an option that is for one policy."""
     if args.recipes is None:
@@ -514,7 +525,7 @@ def _iterate(
 
             return solve_graduated(problem, policy, options, **hooks), steps
         if not args.retriangulate:
-            return solve(problem, policy, options, **hooks), steps
+            return solve(problem, policy, options, checkpoint=args.checkpoint, **hooks), steps
         from jaxba.results.alternation import solve_and_retriangulate
 
         show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))

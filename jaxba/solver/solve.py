@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ from jaxba.problem.residuals import PIXELS
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.numerics import numerics
+from jaxba.solver.checkpoint import Checkpoint, Saved
 from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices, Watch
 from jaxba.solver.options import SolveOptions, checked_options
@@ -161,6 +163,7 @@ def solve(
     callback: Callback | None = None,
     watch: Watch | None = None,
     verbose: bool = False,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
@@ -184,6 +187,7 @@ def solve(
         watch: called before it, with the record and a function that gives the problem with the parameters after the
             iteration; the time that it takes is not counted.
         verbose: whether a row is printed for every iteration, and a line while programs compile.
+        checkpoint: file that is written once a minute and at the end, and from which the same solve continues.
 
     Returns:
         The optimised problem in NumPy float64 arrays, histories and timings.
@@ -191,15 +195,18 @@ def solve(
     Raises:
         ValueError: unknown names, or options that exclude each other, or that contradict the name of the policy.
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
-            the method does not support what the problem has (shared lenses, priors, rigs).
+            the method does not support what the problem has (shared lenses, priors, rigs), or the checkpoint is that of
+            another solve.
         RuntimeError: this process was forked from one in which JAX had started.
         TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`."""
     callback, waiting = shown(callback, verbose)
-    hooks = {"callback": callback, "waiting": waiting}
+    hooks: dict[str, Any] = {"callback": callback, "waiting": waiting}
     check_problem(problem)
     part = observed_part(problem)
     whole = functools.partial(part.whole, problem)
     watched = watch and (lambda record, now: watch(record, lambda: whole(now())))
+    if checkpoint:
+        hooks["checkpoint"] = Checkpoint(checkpoint, part.problem, policy, checked_options(options))
     found = solve_without(None, part.problem, policy, options, watch=watched, **hooks)
     return replace(found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside])
 
@@ -213,11 +220,14 @@ def solve_without(
     callback: Callback | None,
     watch: Watch | None,
     waiting: Waiting = SILENT,
+    checkpoint: Checkpoint | None = None,
 ) -> Solution:
     """`solve` where it is known which images face away; None: it is not. `waiting` is told what takes time."""
     options = checked_options(options)
+    saved = checkpoint and checkpoint.load()
+    problem, away = (saved.problem, saved.away) if saved else (problem, away)
     setup = set_up(problem, policy, options, away, in_parts=True, tell=waiting.tell)
-    alone = callback is None and watch is None
+    alone = not (callback or watch or checkpoint)
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
         driver.compiling = waiting.compiling
@@ -225,8 +235,12 @@ def solve_without(
             state = driver.begin()
         setup.check_cost(state)
         initial_cost, compiled, watched, began = float(state.cost), driver.compile_s(), 0.0, time.perf_counter()
-        elapsed = lambda: time.perf_counter() - began - watched - (driver.compile_s() - compiled)
-        steps, records = None, []
+        initial_cost, before_s = (saved.initial_cost, saved.total_s) if saved else (initial_cost, 0.0)
+        elapsed = lambda: before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
+        steps, records = None, saved.steps if saved else []
+        if saved:
+            driver.carry = saved.continued(driver.carry)
+            waiting.tell(f"goes on after {len(records)} iterations")
         end = Termination.RUNNING if options.max_iterations else Termination.MAX_ITERATIONS
         if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
             steps, end = driver.finish()
@@ -241,6 +255,11 @@ def solve_without(
             watched += time.perf_counter() - looked
             if callback and callback(record) and end == Termination.RUNNING:
                 end = Termination.STOPPED
+            looked = time.perf_counter()
+            if checkpoint and (checkpoint.due or end != Termination.RUNNING):
+                now = setup.problem_at(driver.carry.state), setup.away, initial_cost, record.time_s, records
+                checkpoint.save(Saved(*now, carry=driver.carry))
+            watched += time.perf_counter() - looked
         total_s, compile_s = elapsed(), driver.compile_s()
         driver.end()
         if compile_s > 0:

@@ -173,7 +173,7 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
 
 
 def test_there_are_never_more_clusters_than_the_limit(monkeypatch):
-    monkeypatch.setattr(camera_clusters, "MAX_CLUSTERS", 2)
+    monkeypatch.setattr(camera_clusters, "most_clusters", lambda observations: 2)
     found = clusters_of(build_layout(random_views(30, 25, 0), StepOptions(linear_solver="sparse")))
     assert len(found.members) == 2
 

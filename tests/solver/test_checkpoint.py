@@ -1,0 +1,83 @@
+"""A solve that was stopped or killed continues from its checkpoint and ends as if nothing had happened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import support
+
+import jaxba
+from jaxba import ProblemError, SolveOptions, solve
+from jaxba.problem import geometry
+from jaxba.solver import checkpoint, sharded
+
+OPTIONS = SolveOptions(linear_solver="implicit", max_iterations=8, tolerances=jaxba.Tolerances(ftol=0.0))
+
+
+class Killed(Exception):
+    """Raised in the middle of a solve."""
+
+
+def killed_after(count: int):
+    def callback(record):
+        if record.iteration == count:
+            raise Killed
+        return False
+
+    return callback
+
+
+@pytest.mark.parametrize("in_parts", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("policy", ["ceres", pytest.param("guarded", marks=pytest.mark.slow)])
+def test_a_solve_that_was_killed_continues_to_the_same_end(policy, in_parts, tmp_path, monkeypatch, capsys):
+    problem, file = support.tiny(), tmp_path / "solve.npz"
+    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    if in_parts:
+        monkeypatch.setattr(sharded, "LARGE", 1)
+        monkeypatch.setattr(sharded, "PART", problem.num_observations // 3)
+        monkeypatch.setattr(sharded, "PART_OF_CAMERA", 0)
+    whole = solve(problem, policy, OPTIONS)
+    with pytest.raises(Killed):
+        solve(problem, policy, OPTIONS, checkpoint=file, callback=killed_after(4))
+    assert file.exists()
+    numbers = []
+    found = solve(
+        problem, policy, OPTIONS, checkpoint=file, callback=lambda one: numbers.append(one.iteration), verbose=True
+    )
+    assert "goes on after 3 iterations" in capsys.readouterr().out
+    assert numbers[0] == 4
+    assert found.initial_cost == pytest.approx(whole.initial_cost, rel=1e-12)
+    for name in ("cost", "damping", "accepted"):
+        ours, theirs = (getattr(one.history, name) for one in (found, whole))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    assert geometry.cost(found.problem) == pytest.approx(whole.final_cost, rel=1e-9)
+
+
+def test_numbers_of_residuals_are_in_it_and_more_iterations_may_follow(tmp_path):
+    problem, file = support.tiny(), tmp_path / "solve.npz"
+    problem = jaxba.with_residual(problem, scaled(size=0, pose=[0, 1], measured=0.5), unknowns={"size": [[1.0]]})
+    stopped = solve(problem, "ceres", OPTIONS, checkpoint=file, callback=lambda record: record.iteration == 3)
+    assert stopped.iterations == 3
+    more = SolveOptions(linear_solver="implicit", max_iterations=12, tolerances=jaxba.Tolerances(ftol=0.0))
+    found, whole = solve(problem, "ceres", more, checkpoint=file), solve(problem, "ceres", more)
+    assert found.iterations == whole.iterations
+    np.testing.assert_allclose(found.problem.residuals.blocks[0], whole.problem.residuals.blocks[0], rtol=1e-6)
+
+
+@jaxba.residual
+def scaled(size, pose, *, measured):
+    return size[0] * pose.center[0] - measured
+
+
+def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):
+    problem, file = support.tiny(), tmp_path / "solve.npz"
+    options = SolveOptions(max_iterations=1)
+    solve(problem, "ceres", options, checkpoint=file)
+    for other, policy in ((problem.replace(points=problem.points + 1e-3), "ceres"), (problem, "nielsen")):
+        with pytest.raises(ProblemError, match=r"solve.npz is the checkpoint of another problem, policy or options"):
+            solve(other, policy, options, checkpoint=file)
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ProblemError, match=r"solve.npz is no checkpoint"):
+        solve(problem, "ceres", options, checkpoint=file)
+    with pytest.raises(ProblemError, match="cannot write"):
+        solve(problem, "ceres", options, checkpoint=tmp_path / "missing" / "solve.npz")
