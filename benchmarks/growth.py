@@ -1,10 +1,12 @@
-"""Seconds of an iteration and memory by the number of observations, from 30 thousand to 9 million.
+"""Seconds of an iteration and memory by the number of observations, from 30 thousand to 29 million.
 
-    python -m benchmarks.growth [--sizes 30,100,300,1000,3000,9125] [--devices 1] [--figure FILE.png]
+    python -m benchmarks.growth [--sizes 30,100,300,1000,3000,9125,28988] [--devices 1] [--figure FILE.png]
+    python -m benchmarks.growth --sizes 28988 --policy guarded --iterations 100
 
-Random scenes with the proportions of BAL's Final-4585: 2,000 observations an image, 7 a point. Each is a process of its
-own, solved by the rule `ceres` with the implicit solver for a few iterations; memory is its largest resident set. With
-`JAXBA_CERES` Ceres' iterative mode solves the smaller ones, too. Sizes are in thousands of observations.
+Random scenes with the proportions of BAL's Final-13682: 2,119 observations an image, 6.5 a point; the largest has its
+counts. Each is a process of its own, solved with the implicit solver, by default by the rule `ceres` for a few
+iterations; memory is its largest resident set. With `JAXBA_CERES` Ceres' iterative mode solves the smaller ones, too.
+Sizes are in thousands of observations.
 """
 
 from __future__ import annotations
@@ -15,13 +17,13 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 from benchmarks import peers
 
-OBSERVATIONS_OF_IMAGE, OBSERVATIONS_OF_POINT = 1990, 6.9
-"""Final-4585: 4,585 images, 1,324,582 points, 9,125,125 observations."""
+IMAGES, POINTS, OBSERVATIONS = 13_682, 4_456_117, 28_987_644  # Final-13682
 
 ITERATIONS = 5
 LARGEST_FOR_CERES = 1_000_000
@@ -31,13 +33,14 @@ def scene(observations: int) -> Any:
     """A random scene with so many observations."""
     import jaxba
 
-    images = max(10, round(observations / OBSERVATIONS_OF_IMAGE))
-    points = round(observations / OBSERVATIONS_OF_POINT)
+    images, points = (round(count * observations / OBSERVATIONS) for count in (IMAGES, POINTS))
+    images = max(10, images)
     return jaxba.random_scene(jaxba.SceneConfig(cameras=images, points=points, observations=observations), seed=0)
 
 
-def measure(observations: int, devices: int) -> dict[str, float]:
+def measure(observations: int, args: argparse.Namespace) -> dict[str, Any]:
     """Sizes, seconds and gigabytes of one solve."""
+    devices = args.devices
     import jax
 
     import jaxba
@@ -46,23 +49,29 @@ def measure(observations: int, devices: int) -> dict[str, float]:
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     options = jaxba.SolveOptions(
         linear_solver="implicit",
-        max_iterations=ITERATIONS,
+        max_iterations=args.iterations,
         compilation="full",
+        dtype=args.dtype,
         devices=devices if devices > 1 else None,
-        tolerances=jaxba.Tolerances(ftol=0.0),
+        tolerances=jaxba.Tolerances(**{"ftol": 0.0} if args.iterations == ITERATIONS else {}),
     )
     if devices > 1:
         jax.config.update("jax_num_cpu_devices", devices)
-    found = jaxba.solve(problem, "ceres", options)
+    started = time.perf_counter()
+    found = jaxba.solve(problem, args.policy, options)
     return {
         "observations": problem.num_observations,
         "images": problem.num_cameras,
         "points": problem.num_points,
         "setup_s": found.setup_s,
         "compile_s": found.compile_s,
+        "all_s": time.perf_counter() - started,
         "iteration_s": found.total_s / found.iterations,
+        "iterations": found.iterations,
+        "ended": found.termination.reason,
         "cg_iterations": float(found.history.cg_iterations.mean()),
-        "cost_ratio": found.final_cost / found.initial_cost,
+        "initial_cost": found.initial_cost,
+        "final_cost": found.final_cost,
         "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
         "problem_gb": base,
     }
@@ -84,17 +93,22 @@ def ceres(observations: int) -> float | None:
 def main() -> None:
     """Prints a row for every size, and draws them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", default="30,100,300,1000,3000,9125")
+    parser.add_argument("--sizes", default="30,100,300,1000,3000,9125,28988")
     parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--policy", default="ceres")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--dtype", default="float64")
     parser.add_argument("--figure")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        print(json.dumps(measure(args.one, args.devices)))
+        print(json.dumps(measure(args.one, args)))
         return
     rows = []
-    for size in (1000 * int(size) for size in args.sizes.split(",")):
-        command = [sys.executable, "-m", "benchmarks.growth", "--one", str(size), "--devices", str(args.devices)]
+    names = ("devices", "policy", "iterations", "dtype")
+    passed = [word for name in names for word in (f"--{name}", str(getattr(args, name)))]
+    for size in (min(OBSERVATIONS, round(1000 * float(size))) for size in args.sizes.split(",")):
+        command = [sys.executable, "-m", "benchmarks.growth", "--one", str(size), *passed]
         row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
         row["ceres_s"] = ceres(size) if size <= LARGEST_FOR_CERES else None
         rows.append(row)

@@ -196,7 +196,7 @@ class Output:
     is one, but for these endings, .txt, .bal, .bz2, .gz and .xz. Of several problems: a folder."""
 
     checkpoint: Annotated[str | None, "FILE"] = None
-    """Written once a minute; the same command goes on from it."""
+    """Solve that goes on if killed; written every minute."""
 
     resume: bool = False
     """Go on with several problems where it ended."""

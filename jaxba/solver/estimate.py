@@ -19,7 +19,7 @@ Ladybug-1197."""
 
 BYTES_IN_PARTS = 420.0
 """The same of a process that computes in parts (sharded.py), with the problem. Measured: 370 on a scene of the size of
-Final-13682, `python -m benchmarks.growth --final`."""
+Final-13682, `python -m benchmarks.growth --sizes 28988`."""
 
 SINGLE = 0.6  # share of it in float32
 

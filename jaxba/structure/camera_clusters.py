@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CLUSTER_CAMERAS = 8  # or more, for at most `most_clusters`: as many iterations as with 4, down to half of those with 16
 FEW_CLUSTERS = 128  # that there may be in any case; 1280 coarse unknowns
-COARSE_WORK = 3e4  # cube of coarse unknowns for each observation whose factorisation takes as long as three products
+COARSE_WORK = 5e3  # cube of coarse unknowns for each observation whose factorisation takes as long as two products
 
 
 @register_pytree
