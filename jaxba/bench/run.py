@@ -14,7 +14,6 @@ import jax
 
 import jaxba
 from jaxba.bench.sources import SCENE_PREFIX, Source
-from jaxba.damping import DampingPolicy
 from jaxba.damping.registry import fault, file_of
 from jaxba.io import json_lines
 from jaxba.io.files import visible
@@ -22,13 +21,12 @@ from jaxba.lm.termination import Tolerances
 from jaxba.peers import require
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory, threads
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_solver
-from jaxba.solver.options import MAX_ITERATIONS, SolveOptions
+from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.record import Record, record_of
 from jaxba.solver.solve import Solution, solve
 from jaxba.typing import InputError
@@ -82,19 +80,9 @@ def _solve_by_peer(problem: BundleProblem, solver: SolverName, **options: Any) -
     """The solution by another library, which computes on the host, and what the library is called."""
     from jaxba.peers.ceres import solve_by_ceres
     from jaxba.peers.colmap import backend
-    from jaxba.peers.driven import drive_ceres
 
     mode = solver.peer.partition(":")[2]
-    if not solver.policy:
-        return solve_by_ceres(problem, mode, **options), backend(mode)
-    policy, own = solver.build()
-    return drive_ceres(problem, mode, policy, embedded=embedded_step(policy, own), **options), backend(mode)
-
-
-def embedded_step(policy: DampingPolicy, options: SolveOptions) -> StepOptions | None:
-    """The step with embedded iterations that a peer's step is refined by, None if it is not."""
-    step = options.step_options(policy)
-    return None if step.refinement == Refinement() else step
+    return solve_by_ceres(problem, mode, **options), backend(mode)
 
 
 def machine() -> dict[str, str]:

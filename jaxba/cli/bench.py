@@ -43,9 +43,8 @@ class Arguments:
 
     solvers: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_SOLVERS})")] = None
     """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], where a policy may be a class of
-    your own, mine.py:Tenfold; or, with the extra `ceres`,
-    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default: Ceres'
-    rule without and with embedded iterations, the default policy, and the paper's rule."""
+    your own, mine.py:Tenfold; or, with the extra `ceres`, pyceres:dense|sparse|iterative|dense-inner|sparse-inner.
+    Default: Ceres' rule without and with embedded iterations, the default policy, and the paper's rule."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""

@@ -27,7 +27,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import LinearSolverChoice
 from jaxba.runtime import process
 from jaxba.solver.drivers import IterationRecord
-from jaxba.solver.names import PEERS, SolverName, parse_solver
+from jaxba.solver.names import SolverName, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.record import Record
 from jaxba.solver.solve import solve
@@ -46,15 +46,14 @@ Built: TypeAlias = tuple[DampingPolicy, SolveOptions]
 class Method:
     """The solver of a table row: a policy, perhaps with several training runs, and the options of the step.
 
-    `build` and `driver` get the number of a training run, and a real problem (None: the scenes of the tables); they
-    return None if there is no policy for it. Rules ignore both. They may train it, so they are called only if something
-    has to be run. A policy has collapsed if it does the same in every state in the end."""
+    `build` gets the number of a training run, and a real problem (None: the scenes of the tables); it returns None if
+    there is no policy for it. Rules ignore both. It may train it, so it is called only if something has to be run. A
+    policy has collapsed if it does the same in every state in the end."""
 
     name: str  # in records
     build: Callable[[int, Source | None], Built | None]  # policy and options of a training run
     seeds: int = 0  # number of training runs; 0 for a rule
     peer: SolverName | None = None  # another library that solves real problems, in place of `build`
-    driver: Callable[[int, Source], Path | None] | None = None  # file of the policy that drives it; None: its own rule
     collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False  # whether most policies do so
 
     @property
@@ -100,35 +99,30 @@ class Runner:
         return self._method(kind.name, lambda _: kind, method, linear=linear, twin=twin)
 
     def elsewhere(self, kind: Agent, method: str = "lm", *, twin: bool = False) -> Method:
-        """The same with agents trained on windows of other real problems. A peer's steps are plain LM's."""
-        library = parse_solver(method) if method.partition(":")[0] in PEERS else None
-        steps = "lm" if library else method
-        find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, steps)
+        """The same with agents trained on windows of other real problems."""
+        find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, method)
         name = f"{kind.name}{ELSEWHERE}"
-        return self._method(name if method == "lm" else f"{method}+{name}", find, method, library, twin=twin)
+        return self._method(name if method == "lm" else f"{method}+{name}", find, method, twin=twin)
 
     def _method(
         self,
         name: str,
         find: Callable[[Source | None], Agent | None],
         method: str,
-        library: SolverName | None = None,
         linear: LinearSolverChoice = "auto",
         *,
         twin: bool,
     ) -> Method:
-        def file(seed: int, source: Source | None) -> Path | None:
+        def build(seed: int, source: Source | None) -> Built | None:
             agent, where = find(source), (self.folder, self.report)
             if agent is None:
                 return None
             if twin:
-                return agents.best_constant(self.config, agent, *where)
-            self.done += agents.train(self.config, agent, *where)
-            return agents.own_folder(agent, self.folder) / agents.POLICY.format(seed + 1)
-
-        def build(seed: int, source: Source | None) -> Built | None:
-            path = file(seed, source)
-            return path and (load_policy(path), SolveOptions(method=method, linear_solver=linear))
+                path = agents.best_constant(self.config, agent, *where)
+            else:
+                self.done += agents.train(self.config, agent, *where)
+                path = agents.own_folder(agent, self.folder) / agents.POLICY.format(seed + 1)
+            return load_policy(path), SolveOptions(method=method, linear_solver=linear)
 
         def collapsed(of: Sequence[Source | None]) -> bool:
             named = {agent.name: agent for source in of if (agent := find(source))}
@@ -137,7 +131,7 @@ class Runner:
 
         name += CONSTANT * twin + f"/{linear}" * (linear != "auto")
         seeds = 0 if twin else self.config.agents.seeds
-        return Method(name, build, seeds, library, file if library else None, collapsed)
+        return Method(name, build, seeds, collapsed=collapsed)
 
     def zero_net(self) -> Method:
         """The method with the Zero-net, with as many training runs as an agent."""
@@ -219,13 +213,7 @@ class Runner:
         self.report(f"{source.name} by {method.label(seed)}")
         if built is None:
             assert method.peer
-            solver = method.peer
-            if method.driver:
-                file = method.driver(seed, source)
-                if file is None:
-                    return
-                solver = replace(solver, policy=str(file), refine_points=None)
-            record = run_solver(problem, source, solver, repeat, RunSettings(max_iterations=limit))
+            record = run_solver(problem, source, method.peer, repeat, RunSettings(max_iterations=limit))
         else:
             policy, options = built
             options = replace(options, max_iterations=limit, compilation="full")

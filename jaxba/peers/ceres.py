@@ -1,4 +1,4 @@
-"""Solves with Ceres under its own trust-region rule, and what this shares with `driven.py`. Needs the extra `ceres`.
+"""Solves with Ceres under its own trust-region rule. Needs the extra `ceres`.
 
 The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function ignores, are counted
 (see `colmap.py`)."""
@@ -107,7 +107,7 @@ class Run:
         self.paused += time.perf_counter() - now
         return bool(stop)
 
-    def solution(self, termination: Termination, linear_solver: str, compile_s: float = 0.0) -> Solution:
+    def solution(self, termination: Termination, linear_solver: str) -> Solution:
         """The result, from the recorded iterations."""
         accepted = sum(bool(step.accepted) for step in self.steps)
         return Solution(
@@ -120,7 +120,7 @@ class Run:
             history=StepInfo.stacked(self.steps),
             linear_solver=linear_solver,
             setup_s=self.setup_s,
-            compile_s=compile_s,
+            compile_s=0.0,
             total_s=self.total_s,
         )
 
@@ -134,11 +134,11 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
     return StepInfo(**{**fields, **known})
 
 
-def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str, **known: Any) -> StepInfo:
+def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str) -> StepInfo:
     """Converts Ceres' summaries of an iteration and of the one before it, which has the gradient at the start of the
     step, into a `StepInfo`. Of a rejected step they have the candidate's cost only, so the last accepted one is given,
-    and lambda. Only the iterative mode counts conjugate gradients. `known` are fields that Ceres does not report."""
-    fields = {
+    and lambda. Only the iterative mode counts conjugate gradients."""
+    fields: dict[str, Any] = {
         "previous_cost": previous_cost,
         "gradient_max": before.gradient_max_norm,
         "step_norm": now.step_norm,
@@ -152,7 +152,7 @@ def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: s
             fields["predicted"] = now.cost_change / now.relative_decrease
     else:
         fields["candidate_cost"] = np.inf
-    return step_info(now.cost if now.step_is_successful else previous_cost, damping, **{**fields, **known})
+    return step_info(now.cost if now.step_is_successful else previous_cost, damping, **fields)
 
 
 class _RecordingCallback(pyceres.IterationCallback):

@@ -154,11 +154,6 @@ class ColmapProblem:
         self.in_python[new] = True
         return len(new)
 
-    def add_point_cost(self, cost: Any, point: int) -> None:
-        """Adds a cost function of one point that is not an observation."""
-        self._costs.append(cost)
-        self.ceres.add_residual_block(cost, None, [self._points[point]])
-
     def parameters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Copies of `poses`, `lenses` and `points`."""
         return self.poses.copy(), self.lenses.copy(), self.points.copy()
@@ -167,10 +162,6 @@ class ColmapProblem:
         """Sets the parameters to what `parameters` returned, in place."""
         for block, old in zip((self.poses, self.lenses, self.points), parameters, strict=True):
             block[:] = old
-
-    def set_parameters_of(self, problem: BundleProblem) -> None:
-        """Sets the parameters to those of a problem of the same shape, in place."""
-        self.restore(_parameters(problem))
 
     def bundle(self) -> BundleProblem:
         """The problem at the current parameters. Cameras without observations are unchanged."""

@@ -1,7 +1,6 @@
 """Solver names, the same in all commands, tables and files: `[method+]policy[+refineK|+embedded][@dtype]`.
 
-Another library as a solver (a peer) is named `pyceres:MODE`, or `pyceres:MODE+policy[+refineK|+embedded]` if a damping
-policy of jaxba chooses its lambda."""
+Another library as a solver (a peer) is named `pyceres:MODE`."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ class SolverName:
     """A parsed solver name; `str` returns its shortest form."""
 
     policy: str
-    """Name of the damping policy, see `jaxba.damping.make_policy`."""
+    """Name of the damping policy, see `jaxba.damping.make_policy`; empty for a peer."""
 
     refine_points: int | None = 0
     """Number of embedded point iterations, without any other refinement. None: the step that a policy brings (a learned
@@ -47,16 +46,16 @@ class SolverName:
     """Name of the optimisation method, see `jaxba.methods`."""
 
     peer: str = ""
-    """`LIBRARY:MODE` if another library computes the steps, with its own damping rule if `policy` is empty."""
+    """`LIBRARY:MODE` if another library solves, by its own damping rule."""
 
     def __str__(self) -> str:
+        if self.peer:
+            return self.peer
         refinement = ""
         if self.refine_points is None:
             refinement = "" if brings_step(self.policy) else "+embedded"
         elif self.refine_points or brings_step(self.policy):
             refinement = f"+refine{self.refine_points}"
-        if self.peer:
-            return f"{self.peer}+{self.policy}{refinement}" if self.policy else self.peer
         method = "" if self.method == DEFAULT_METHOD else f"{self.method}+"
         dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
         return f"{method}{self.policy}{refinement}{dtype}"
@@ -127,8 +126,11 @@ def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, Sol
 
 def parse_solver(name: str) -> SolverName:
     """Parses a solver name. Raises InputError: an unknown method, mode, type or policy, or a malformed name."""
-    if name.strip().partition(":")[0] in PEERS:
-        return _parse_peer(name.strip())
+    library, _, mode = name.strip().partition(":")
+    if library in PEERS:
+        if mode not in PEERS[library]:
+            raise InputError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
+        return SolverName("", peer=name.strip())
     # the path of a file may contain `+` and `@`
     named = re.match(rf"(.*\{SUFFIX}|{OWN})(.*)", name.strip(), re.DOTALL)
     path, rest = named.groups() if named else ("", name.strip())
@@ -160,19 +162,3 @@ def parse_solver(name: str) -> SolverName:
     if brings_step(merged[0]) and not stated:
         refine = None
     return SolverName(merged[0], refine, cast(Dtype, dtype or DTYPES[0]), method)
-
-
-def _parse_peer(name: str) -> SolverName:
-    """Parses the name of a peer."""
-    peer, plus, policy = name.partition("+")
-    library, _, mode = peer.partition(":")
-    if mode not in PEERS[library]:
-        raise InputError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
-    if not plus:
-        return SolverName("", peer=peer)
-    if mode.endswith(INNER):  # Ceres includes them in its gain ratio, which a policy could not interpret
-        raise InputError(f"{name!r} is no solver; {library} has inner iterations under its own rule alone")
-    driver = parse_solver(policy)
-    if driver != SolverName(driver.policy, driver.refine_points):
-        raise InputError(f"{name!r} is no solver; the form is {peer}+policy[+refineK|+embedded]")
-    return SolverName(driver.policy, driver.refine_points, peer=peer)

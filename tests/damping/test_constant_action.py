@@ -70,9 +70,8 @@ def test_an_action_between_the_bounds_is_played_as_it_is():
     np.testing.assert_allclose(np.log10(found.history.damping), -2.5, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["bold", "pyceres:dense+bold"])
-def test_bold_has_the_step_of_rules_with_embedded_iterations(name):
-    policy, options = parse_solver(name).build()
+def test_bold_has_the_step_of_rules_with_embedded_iterations():
+    policy, options = parse_solver("bold").build()
     assert isinstance(policy, ConstantAction)
     assert options.step_options(policy) == policy.step_options(StepOptions())
     assert options.step_options(policy) == parse_solver("ceres+embedded").build()[1].step_options(make_policy("ceres"))

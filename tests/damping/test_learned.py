@@ -298,10 +298,8 @@ def test_the_shipped_policy_is_wired_as_the_preset_of_its_files_name():
 
 
 def test_the_shipped_policy_chooses_lambda_alone():
-    """Which is all that Ceres' one radius can do."""
-    for name in ("learned", "pyceres:dense+learned"):
-        policy, options = parse_solver(name).build()
-        assert options.step_options(policy) == StepOptions()
+    policy, options = parse_solver("learned").build()
+    assert options.step_options(policy) == StepOptions()
 
 
 # Solves

@@ -11,8 +11,6 @@ from jaxba import peers
 from jaxba.bench import run as bench_run
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run
-from jaxba.damping import LearnedPolicy
-from jaxba.problem.options import StepOptions
 from jaxba.solver.names import PEERS, SolverName, parse_solver
 from jaxba.typing import InputError
 
@@ -24,14 +22,6 @@ from jaxba.typing import InputError
         ("pyceres:sparse", SolverName("", peer="pyceres:sparse"), None),
         (" pyceres:iterative ", SolverName("", peer="pyceres:iterative"), "pyceres:iterative"),
         ("pyceres:dense-inner", SolverName("", peer="pyceres:dense-inner"), None),
-        ("pyceres:dense+learned", SolverName("learned", None, peer="pyceres:dense"), None),
-        ("pyceres:dense+learned+refine0", SolverName("learned", peer="pyceres:dense"), None),
-        ("pyceres:dense+learned+embedded", SolverName("learned", None, peer="pyceres:dense"), "pyceres:dense+learned"),
-        ("pyceres:sparse+ceres+embedded", SolverName("ceres", None, peer="pyceres:sparse"), None),
-        ("pyceres:dense+ceres+refine3", SolverName("ceres", 3, peer="pyceres:dense"), None),
-        ("pyceres:dense+ceres+refine0", SolverName("ceres", peer="pyceres:dense"), "pyceres:dense+ceres"),
-        ("pyceres:sparse+constant:1e+2", SolverName("constant:1e+2", peer="pyceres:sparse"), None),
-        ("pyceres:iterative+classic:0.03", SolverName("classic:0.03", peer="pyceres:iterative"), None),
     ],
 )
 def test_solver_names_of_other_libraries_are_parsed_and_printed(text, name, shortest):
@@ -46,17 +36,9 @@ def test_solver_names_of_other_libraries_are_parsed_and_printed(text, name, shor
         ("pyceres", "known: dense, sparse, iterative"),
         ("pyceres:", "known: dense, sparse, iterative"),
         ("pyceres:qr", "unknown mode 'qr'"),
-        ("pyceres:qr+ceres", "unknown mode 'qr'"),
+        ("pyceres:dense+ceres", "unknown mode 'dense+ceres'"),
         ("pyceres:dense@float32", "unknown mode 'dense@float32'"),
         ("pyceres:iterative-inner", "unknown mode 'iterative-inner'"),
-        ("pyceres:sparse-inner+ceres", "inner iterations under its own rule alone"),
-        ("pyceres:dense+", "is no solver"),
-        ("pyceres:dense+cerse", "unknown damping policy 'cerse'"),
-        ("pyceres:dense+ceres+refine", "unknown method 'ceres'"),
-        ("pyceres:dense+stba+ceres", "the form is pyceres:dense+policy[+refineK|+embedded]"),
-        ("pyceres:dense+ceres@float32", "the form is pyceres:dense+policy[+refineK|+embedded]"),
-        ("pyceres:dense+pyceres:dense", "the form is pyceres:dense+policy"),
-        ("pyceres:dense+pyceres:dense+ceres", "the form is pyceres:dense+policy"),
         ("lm+pyceres:dense", "unknown damping policy 'pyceres:dense'"),
     ],
 )
@@ -67,20 +49,6 @@ def test_what_is_no_peer_is_one_clear_line(text, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["learned", "learned+refine0"])
-def test_the_learned_policy_drives_a_peer_without_embedded_iterations(name):
-    policy, options = parse_solver(f"pyceres:dense+{name}").build()
-    assert isinstance(policy, LearnedPolicy)
-    assert options.step_options(policy) == StepOptions()
-
-
-def test_a_policy_brings_its_embedded_iterations_to_a_peer():
-    policy, options = parse_solver("pyceres:dense+bold").build()
-    ours, same = parse_solver("bold").build()
-    assert (policy, options) == (ours, same)
-    assert options.step_options(policy).refinement.points
-
-
 def test_every_peer_says_what_brings_it():
     assert set(peers.NEEDS) == set(PEERS)
 
@@ -88,7 +56,7 @@ def test_every_peer_says_what_brings_it():
 def test_without_its_library_a_peer_is_refused_before_anything_runs(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(peers, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
-        bench_run.plan(sources(["scene:tiny"]), ["classic", "pyceres:dense+classic"], 1)
+        bench_run.plan(sources(["scene:tiny"]), ["classic", "pyceres:dense"], 1)
     assert run(["scene:tiny", "--solvers", "classic,pyceres:dense", "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: 'pyceres:dense' needs pyceres")
@@ -102,5 +70,5 @@ def test_without_its_library_the_module_says_what_to_install(monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pyceres", None)
     with pytest.raises(ImportError, match=r"pip install jaxba\[ceres\]") as caught:
-        importlib.import_module("jaxba.peers.driven")
+        importlib.import_module("jaxba.peers.ceres")
     assert "\n" not in str(caught.value)
