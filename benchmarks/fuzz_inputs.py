@@ -136,24 +136,6 @@ def _alicevision(folder: Path) -> None:
     (folder / "a.sfm").write_text(json.dumps({**contents, "structure": structure}))
 
 
-def _nvm(folder: Path) -> None:
-    rotations, translations = _poses()
-    centers = -np.einsum("nji,nj->ni", rotations, translations)
-    half = _turned() / 2
-    angles = np.linalg.norm(half, axis=1, keepdims=True)
-    quaternions = np.concatenate([np.cos(angles), np.sinc(angles / np.pi) * half], axis=1)
-    lines = ["NVM_V3", "", str(len(centers))]
-    for i, (q, c) in enumerate(zip(quaternions.tolist(), centers.tolist(), strict=True)):
-        lines.append(" ".join(map(str, [f"{i}.jpg", 700.0, *q, *c, 0, 0])))
-    seen: dict[int, list] = {}
-    for i, j, x, y in _views():
-        seen.setdefault(j, []).extend([i, 0, x, y])
-    lines += ["", str(len(seen))]
-    for j, of in seen.items():
-        lines.append(" ".join(map(str, [*SCENE.points[j].tolist(), 1, 2, 3, len(of) // 4, *of])))
-    (folder / "a.nvm").write_text("\n".join([*lines, "", "0", ""]))
-
-
 def _kitti(folder: Path) -> None:
     """A textured plane, oblique to the camera, which drives towards it."""
     from jaxba.kitti.opencv import cv2
@@ -214,7 +196,6 @@ INPUTS = (
     _solved("Bundler", _problem("a.out"), "a.out", 4),
     _solved("COLMAP, binary", lambda folder: _colmap(folder, binary=True), "model", 6),
     _solved("COLMAP, text", _colmap, "model", 6),
-    _solved("VisualSFM", _nvm, "a.nvm", 2),
     _solved("OpenSfM", _opensfm, "reconstruction.json", 2),
     _solved("OpenMVG", _openmvg, "a.json", 2),
     _solved("AliceVision", _alicevision, "a.sfm", 2),

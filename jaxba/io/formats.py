@@ -34,12 +34,6 @@ class Format:
     begins: tuple[bytes, ...] = ()  # first bytes after blanks, by which a file without a known ending is recognised
 
 
-def _read_nvm(path: StrPath) -> BundleProblem:
-    from jaxba.io.foreign.nvm import read_nvm
-
-    return read_nvm(path)
-
-
 def _read_json(path: StrPath) -> BundleProblem:
     """Reads OpenSfM's, OpenMVG's or AliceVision's file, which are told apart by their contents."""
     from jaxba.io.foreign import alicevision, json_records, openmvg, opensfm
@@ -61,7 +55,6 @@ TRANSFORMS = Format("nerfstudio's cameras", (".json",), write=write_transforms, 
 FORMATS = (
     Format("BAL", (".txt", ".bal"), read_bal, write_bal, check_bal_lenses),
     Format("Bundler", (".out",), read_bundler, write_bundler, check_bal_lenses, (b"# Bundle file",)),
-    Format("VisualSFM", (".nvm",), _read_nvm, begins=(b"NVM_V3",)),
     Format("OpenSfM, OpenMVG or AliceVision", (".json", ".sfm"), _read_json, begins=(b"{", b"[")),
     Format("PLY", (".ply",), write=write_ply),
     TRANSFORMS,
@@ -70,7 +63,7 @@ FORMATS = (
 
 OTHER_ENDINGS = (
     *(".7z", ".abc", ".bin", ".csv", ".dae", ".db", ".fbx", ".g2o", ".glb", ".gltf", ".graph", ".h5", ".hdf5"),
-    *(".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mvs", ".npy", ".npz"),
+    *(".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mvs", ".npy", ".npz", ".nvm"),
     *(".obj", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".psx", ".pt", ".py", ".rar", ".safetensors", ".sql"),
     *(".sqlite", ".stl", ".tar", ".tbz2", ".tgz", ".tif", ".toml", ".tsv", ".txz", ".usd", ".vtk", ".xml"),
     *(".xyz", ".yaml", ".yml", ".z", ".zip", ".zst"),

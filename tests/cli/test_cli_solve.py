@@ -505,9 +505,9 @@ BAD = {
         lambda tiny: [str(tiny), "--output", f"{tiny.parent}/no/new/"],
         "no does not exist",
     ),
-    "output that would be read as VisualSFM's": (
-        lambda tiny: [str(tiny), "--output", "o.nvm"],
-        "cannot write o.nvm: files of VisualSFM",
+    "output that would be read as AliceVision's": (
+        lambda tiny: [str(tiny), "--output", "o.sfm"],
+        "cannot write o.sfm: files of OpenSfM, OpenMVG or AliceVision",
     ),
     "compressed output of another format": (
         lambda tiny: [str(tiny), "--output", "o.zip.gz"],

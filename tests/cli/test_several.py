@@ -61,8 +61,8 @@ def test_one_that_fails_is_one_line_and_the_others_go_on(problems, tmp_path, cap
 
 
 def test_what_is_only_read_is_written_as_a_bal_file_and_a_folder_of_opensfm_is_one_problem(problems, tmp_path):
-    paths = ["a/x.nvm", "a/y.json", "a/z.txt.gz"]
-    assert several._names(paths) == ["x.nvm.txt", "y.json.txt", "z.txt.gz"]
+    paths = ["a/x.sfm", "a/y.json", "a/z.txt.gz"]
+    assert several._names(paths) == ["x.sfm.txt", "y.json.txt", "z.txt.gz"]
     (tmp_path / "sfm").mkdir()
     (tmp_path / "sfm" / "reconstruction.json").write_text("[]")
     assert several.inputs([str(tmp_path / "sfm")]) == []

@@ -203,38 +203,3 @@ def write_alicevision(path: Path, scene: Scene, types: list[str], version: tuple
     contents = {"version": [str(x) for x in version], "views": views, "intrinsics": intrinsics, "poses": poses}
     path.write_text(json.dumps(contents | {"structure": structure}))
     return path
-
-
-def write_nvm(path: Path, scene: Scene, distortion: list[float], header: str = "NVM_V3") -> Path:
-    """VisualSFM's file. Lenses must be pinholes; pixels are measured so that (1 + r |m|^2 / f^2) m is their undistorted
-    pixel, and comments follow."""
-    measured = []
-    for (i, _), pixel in zip(scene.seen, scene.pixels, strict=True):
-        lens = scene.lenses[scene.lens_of[i]]
-        measured.append(measure((pixel - [lens.cx, lens.cy]) / lens.fx, distortion[i]) * lens.fx)
-    lines = [header, "", str(len(scene.lens_of))]
-    for i, rotation in enumerate(scene.rotations):
-        x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
-        lens, center = scene.lenses[scene.lens_of[i]], scene.centers[i].tolist()
-        pose = [w, x, y, z, *center]
-        if header.startswith("NVM_V3_R9T"):
-            pose = [*rotation.ravel().tolist(), *(-rotation @ scene.centers[i]).tolist()]
-        lines.append(f"image with blanks {i}.jpg\t{lens.fx!r} {' '.join(map(repr, pose))} {distortion[i]!r} 0")
-    lines += ["", str(len(scene.points))]
-    for j, point in enumerate(scene.points.tolist()):
-        seen = [(i, m.tolist()) for (i, other), m in zip(scene.seen, measured, strict=True) if other == j]
-        views = " ".join(f"{i} 7 {x!r} {y!r}" for i, (x, y) in seen)
-        lines.append(f"{point[0]!r} {point[1]!r} {point[2]!r} 1 2 3 {len(seen)} {views}")
-    lines += ["", "0", "#the last part"]
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def measure(undistorted: np.ndarray, r: float) -> np.ndarray:
-    """m with (1 + r |m|^2) m = undistorted, by the real root of the cubic."""
-    radius = float(np.hypot(*undistorted))
-    if not r:
-        return undistorted
-    roots = np.roots([r, 0, 1, -radius])
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    return undistorted * min(x for x in real if x > 0) / radius

@@ -1,4 +1,4 @@
-"""Files of VisualSFM, OpenSfM, OpenMVG and AliceVision: the cost is that of each program's own projection."""
+"""Files of OpenSfM, OpenMVG and AliceVision: the cost is that of each program's own projection."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import subprocess
 import sys
 import warnings
 
-import foreign_scene
 import numpy as np
 import pytest
-from foreign_scene import Lens, Scene, write_alicevision, write_nvm, write_openmvg, write_opensfm
+from foreign_scene import Lens, Scene, write_alicevision, write_openmvg, write_opensfm
 
 from jaxba.io import ProblemWarning, read_colmap, read_problem, write_colmap
 from jaxba.problem import geometry
@@ -26,8 +25,6 @@ BROWN = Lens(fy=1230.0, radial=(-0.12, 0.03, 0.01), tangential=(0.003, -0.002))
 FISHEYE = Lens(cx=800.0, cy=600.0, fx=900.0, fy=900.0, radial=(0.02, -0.01), fisheye=True)
 FISHEYE4 = Lens(fx=900.0, fy=900.0, radial=(0.02, -0.01, 0.004, -0.002), fisheye=True)
 ROUNDING = 1e-9
-FIRST_ORDER = 0.02
-"""Of the cost, where VisualSFM's undistorted observations are weighted to first order, at half a pixel of noise."""
 
 
 def scene_of(*lenses: Lens, noise: float = 0.5) -> Scene:
@@ -134,50 +131,6 @@ def test_locked_intrinsics_stay(tmp_path):
     assert free(read_problem(path)) == [[False] * 3]
 
 
-@pytest.mark.parametrize("header", ["NVM_V3", "NVM_V3_R9T", "NVM_V3 "])
-def test_visualsfm_s_pinholes_are_bal_s(tmp_path, header):
-    scene = scene_of(PINHOLE)
-    problem = read_problem(write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5, header))
-    check(problem, scene, ROUNDING)
-    assert problem.lenses is None
-
-
-def test_visualsfm_s_distortion_goes_from_the_measured_pixel(tmp_path):
-    scene, values = scene_of(PINHOLE), [0.1, -0.05, 0.0, 0.02, 0.2]
-    problem = read_problem(write_nvm(tmp_path / "a.nvm", scene, values))
-    assert free(problem) == [[True, r == 0, r == 0] for r in values]
-    np.testing.assert_allclose(geometry.project(problem) * [1, -1], scene.predicted - [800, 600], atol=1e-8)
-    np.testing.assert_allclose(np.asarray(problem.observations) * [1, -1], scene.pixels - [800, 600], atol=1e-8)
-    exact = 0.0  # in measured pixels
-    for (i, _), seen, predicted in zip(scene.seen, scene.pixels, scene.predicted, strict=True):
-        places = [foreign_scene.measure((pixel - [800, 600]) / 1200, values[i]) for pixel in (seen, predicted)]
-        exact += 0.5 * 1200**2 * float(np.sum((places[0] - places[1]) ** 2))
-    np.testing.assert_allclose(geometry.cost(problem), exact, rtol=FIRST_ORDER)
-    assert abs(exact - scene.cost) > 2 * FIRST_ORDER * exact  # the weights matter
-
-
-def test_visualsfm_s_fixed_calibration_holds_for_all_images(tmp_path):
-    scene = scene_of(Lens(fy=1230.0, cx=800.0, cy=600.0))
-    problem = read_problem(write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5, "NVM_V3 FixedK 1200 800 1230 600 0"))
-    check(problem, scene, ROUNDING)
-    assert free(problem) == [[False] * 3]
-    assert np.asarray(problem.lenses.index).tolist() == [0] * 5
-
-
-def test_observations_beyond_the_fold_of_a_lens_are_left_out_and_counted(tmp_path):
-    scene = scene_of(PINHOLE)
-    path = write_nvm(tmp_path / "a.nvm", scene, [-0.05] * 5)  # m (1 + r m^2) grows up to m = sqrt(-1 / 3r), 3098.4 px
-    lines = path.read_text().split("\n")
-    words = lines[10].split()  # point 0 and its views
-    inside, outside = ([*words[:9], x, "0.0", *words[11:]] for x in ("-3098.0", "-3099.0"))
-    path.write_text("\n".join([*lines[:10], " ".join(inside), *lines[11:]]))
-    assert read_problem(path).num_observations == len(scene.seen)
-    path.write_text("\n".join([*lines[:10], " ".join(outside), *lines[11:]]))
-    with pytest.warns(ProblemWarning, match=rf"a\.nvm: 1 of {len(scene.seen)} observations left out") as caught:
-        assert read_problem(path).num_observations == len(scene.seen) - 1
-    assert len(caught) == 1
-
-
 def test_views_that_are_not_reconstructed_are_left_out_and_counted(tmp_path):
     scene = scene_of(Lens())
     path = write_openmvg(tmp_path / "sfm_data.json", scene, ["pinhole"])
@@ -257,13 +210,6 @@ def alicevision_with_more(folder):
     return changed_json(write_alicevision(folder / "a.sfm", scene_of(PINHOLE), ["pinhole"], (1, 2, 1)), with_locks)
 
 
-def nvm_with_more(folder):
-    path = write_nvm(folder / "a.nvm", scene_of(PINHOLE), [0.0] * 5)
-    second = "\n2\nlost.jpg 100 1 0 0 0 0 0 0 0 0\nlost2.jpg 100 1 0 0 0 0 0 0 0 0\n0\n0\n"
-    path.write_text(path.read_text().replace("\n0\n#", f"{second}#"))
-    return path
-
-
 @pytest.mark.parametrize(
     ("write", "message"),
     [
@@ -274,7 +220,6 @@ def nvm_with_more(folder):
             "not used: measured positions (1), priors of cameras (1), gcp_list.txt beside it (1), scales of "
             "key-points ({})",
         ),
-        (nvm_with_more, "only the first model of the file is read"),
     ],
 )
 def test_what_a_file_holds_and_nothing_uses_is_one_note_and_refused_if_strict(write, message, tmp_path):
@@ -291,9 +236,6 @@ def test_what_a_file_holds_and_nothing_uses_is_one_note_and_refused_if_strict(wr
 
 def test_compressed_marked_and_windows_files_are_read_too(tmp_path):
     scene = scene_of(PINHOLE)
-    nvm = write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5).read_bytes().replace(b"\n", b"\r\n")
-    (tmp_path / "A.NVM.GZ").write_bytes(gzip.compress(b"\xef\xbb\xbf" + nvm))
-    check(read_problem(tmp_path / "A.NVM.GZ"), scene, ROUNDING)
     path = write_opensfm(tmp_path, scene, ["perspective"])
     text, tracks = path.read_text(), (tmp_path / "tracks.csv").read_bytes()
     (tmp_path / "tracks.csv").unlink()
@@ -434,30 +376,6 @@ def test_bad_scenes_of_alicevision_are_refused_by_record_and_field(tmp_path, old
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    assert words in refused(path)
-
-
-@pytest.mark.parametrize(
-    ("line", "text", "words"),
-    [
-        (1, "NVM_V4", "line 1: 'NVM_V4' is not the header 'NVM_V3' of a VisualSFM file"),
-        (1, "NVM_V3 FixedK 1 2", "line 1: after NVM_V3 there must be nothing, or FixedK and fx cx fy cy r"),
-        (3, "-5", "line 3: -5 is no number of images of a model"),
-        (3, "1e9", "line 10: image 5 has 1 fields instead of 11"),
-        (4, "a.jpg 1 2 3", "line 4: image 0 has 4 fields instead of 11"),
-        (4, "a.jpg 100 1 0 0 0 0 0 nan 0 0", "line 4: image 0: 'nan' is not a finite number (cz)"),
-        (4, "a.jpg 100 0 0 0 0 0 0 0 0 0", "line 4: image 0: qw to qz are no rotation"),
-        (4, "a.jpg -100 1 0 0 0 0 0 0 0 0", "image 0 has focal length -100, which must be positive"),
-        (10, "1000000000", "line 43: '#the' is not a number (y of point 30)"),
-        (11, "0 0 9 1 2 3 1 5 0 1 1", "line 11: '5' is outside 0..4 (camera index of view 0 of point 0)"),
-        (11, "0 0 9 1 2 3 4 x", "line 11: 'x' is not a number (camera index of view 0 of point 0)"),
-    ],
-)
-def test_bad_files_of_visualsfm_are_refused_by_line_and_field(tmp_path, line, text, words):
-    path = write_nvm(tmp_path / "a.nvm", scene_of(PINHOLE), [0.0] * 5)
-    lines = path.read_text().split("\n")
-    lines[line - 1] = text
-    path.write_text("\n".join(lines))
     assert words in refused(path)
 
 

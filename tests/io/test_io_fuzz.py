@@ -26,11 +26,7 @@ CAMERAS = (
 )
 POINTS = b"1.0 2.0 -3.0\n255 0 7\n2 0 11 10.5 -20.5 1 12 30.5 40.5\n4.0 5.0 -6.0\n0 0 0\n1 1 13 -1.5 1e1\n"
 BUNDLER = b"# Bundle file v0.3\n3 2\n" + CAMERAS + POINTS
-NVM = (
-    b"NVM_V3 FixedK 500 320 510 240 0.1\n\n2\na.jpg 500 1 0 0 0 0 0 0 0.1 0\nb c.jpg 500 0.9 0.1 0 0 1 0 0 -0.1 0\n\n"
-    b"2\n1 2 9 0 0 0 2 0 5 10.5 -20.5 1 6 30.5 40.5\n4 5 16 1 2 3 1 1 13 -1.5 1e1\n\n0\n"
-)
-SEEDS = {"a.txt": BAL, "a.out": BUNDLER, "a.nvm": NVM}
+SEEDS = {"a.txt": BAL, "a.out": BUNDLER}
 PACKERS = {"": bytes, ".bz2": bz2.compress, ".gz": lambda data: gzip.compress(data, mtime=0), ".xz": lzma.compress}
 WORDS = [
     b"nan",
@@ -223,7 +219,7 @@ def test_damaged_bytes_of_json_and_tracks_are_refused_or_still_a_problem(tmp_pat
 @fuzz
 @given(
     content=st.binary(max_size=200),
-    name=st.sampled_from(["a.txt", "a.out", "a.txt.gz", "a.bz2", "a.out.xz", "a.nvm", "a.json", "a.sfm"]),
+    name=st.sampled_from(["a.txt", "a.out", "a.txt.gz", "a.bz2", "a.out.xz", "a.json", "a.sfm"]),
 )
 def test_random_bytes_are_refused(tmp_path, content, name):
     check(tmp_path / name, content)

@@ -100,8 +100,8 @@ def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
         x, y = x + width / 2, y + height / 2
     fisheye = model == "fisheye4"
     distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
-    free = not value.get("locked", False).flag()
-    return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, fisheye, free, (width, height))
+    size, free = (width, height), not value.get("locked", False).flag()
+    return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, fisheye, size, free)
 
 
 def _focal(value: Record, version: tuple[int, ...], width: float) -> tuple[float, float]:

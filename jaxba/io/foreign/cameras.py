@@ -1,14 +1,14 @@
 """From the cameras of other programs to a problem: lenses in pixels, poses that look down +z with y downwards.
 
-This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision; the last three also have views with poses
-and intrinsics, and points with observations, in common (`build`). BAL's camera looks down -z with y
-upwards, has no principal point, one focal length, and two coefficients of distortion. Lenses with more of it become
-those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE."""
+This is the convention of OpenSfM, OpenMVG and AliceVision, which have views with poses and intrinsics, and points with
+observations, in common. BAL's camera looks down -z with y upwards, has no principal point, one focal length, and two
+coefficients of distortion. Lenses with more of it become those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and
+OPENCV_FISHEYE."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,11 +40,11 @@ class ForeignLens:
 
     label: str  # how messages call it, such as `intrinsic 3`
     focal: tuple[float, float]  # along x and y, pixels; their ratio stays where the distortion is BAL's
-    center: tuple[float, float] = (0.0, 0.0)  # principal point in the coordinates of the observations; stays
-    distortion: Mapping[str, float] = field(default_factory=dict)  # by names of the camera models; others are zero
-    fisheye: bool = False  # whether radii are angles
+    center: tuple[float, float]  # principal point from the corner of the image, as observations are; stays
+    distortion: Mapping[str, float]  # by names of the camera models; others are zero
+    fisheye: bool  # whether radii are angles
+    size: tuple[float, float]  # of the image, pixels
     free: bool = True  # whether f, k1 and k2, where they are coefficients of BAL's distortion, may be optimised
-    size: tuple[float, float] | None = None  # of the image, pixels, if the principal point is from its corner
 
     @property
     def is_bal(self) -> bool:
@@ -59,8 +59,7 @@ class ForeignLens:
         return "RADIAL" if self.is_bal and self.focal[0] == self.focal[1] else "FULL_OPENCV"
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
-def assemble(
+def _assemble(
     path: StrPath,
     lenses: Sequence[ForeignLens],
     lens_of: Int[np.ndarray, " cameras"],
@@ -70,18 +69,15 @@ def assemble(
     pixels: Float[np.ndarray, "observations 2"],
     camera_index: Int[np.ndarray, " observations"],
     point_index: Int[np.ndarray, " observations"],
-    whitening: Float[np.ndarray, "observations 2 2"] | None = None,
 ) -> BundleProblem:
     """The problem of cameras in the convention of this module, `P = R X + t`, with pixels x to the right, y down.
 
-    Where the distortion of all lenses is BAL's, so are those of the problem, and `whitening` multiplies their
-    residuals; else all are of the other models. Pixels that are not finite are left out, with a warning that counts
-    them. Raises ProblemError: a lens is impossible, no observation is left, or something is not finite."""
+    Where the distortion of all lenses is BAL's, so are those of the problem, and covariances stand for a ratio of focal
+    lengths; else all are of the other models. Raises ProblemError: a lens is impossible, or something is not finite."""
     name = display_name(path)
     for lens in lenses:
         _check(lens, name)
-        if lens.size is not None:
-            note_center(path, lens.label, lens.center, lens.size)
+        note_center(path, lens.label, lens.center, lens.size)
     bal = all(lens.is_bal for lens in lenses)
     names = ["BAL" if bal else lens.model for lens in lenses]
     models = tuple(CAMERA_MODELS[model] for model in dict.fromkeys(names))
@@ -93,18 +89,12 @@ def assemble(
         moves = {"f", "fx", "fy", *({"k1", "k2"} & set(lens.distortion))} if lens.free and lens.is_bal else set()
         for place, parameter in enumerate(CAMERA_MODELS[model].parameters):
             intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), parameter in moves
-    lens_of = np.asarray(lens_of)
-    observations = pixels
+    observations, covariance = pixels, None
     if bal:
         focal, centers = (np.array([getattr(lens, name) for lens in lenses]) for name in ("focal", "center"))
         ratio = (focal / focal[:, :1])[lens_of][camera_index]
         observations = (pixels - centers[lens_of][camera_index]) / ratio * COLMAP_FLIP[:2]
-        whitening = ratio[:, :, None] * (np.eye(2) if whitening is None else whitening)
-    kept = np.flatnonzero(np.isfinite(observations).all(axis=1))
-    if len(kept) < len(pixels):
-        note(path, f"{len(pixels) - len(kept)} of {len(pixels)} observations left out: beyond the range of their lens")
-    if not len(kept):
-        raise ProblemError(f"{name}: no camera sees a point")
+        covariance = None if (ratio == 1).all() else np.eye(2) / ratio[:, :, None] ** 2
     unshared = len(np.unique(lens_of)) == len(lens_of)
     model_of = None if bal else np.array([list(dict.fromkeys(names)).index(model) for model in names])
     poses = [angle_axis(np.diag(COLMAP_FLIP) @ rotations), translations * COLMAP_FLIP]
@@ -112,10 +102,10 @@ def assemble(
         return BundleProblem.create(
             np.hstack([*poses, intrinsics[lens_of]]),
             points,
-            observations[kept],
-            np.asarray(camera_index)[kept],
-            np.asarray(point_index)[kept],
-            covariance=None if whitening is None else _covariance(whitening[kept]),
+            observations,
+            camera_index,
+            point_index,
+            covariance=covariance,
             lenses=None if bal and unshared and free.all() else Lenses(lens_of, free, model_of, models),
         )
     except ProblemError as error:
@@ -129,14 +119,6 @@ def _check(lens: ForeignLens, name: str) -> None:
     if not min(lens.focal) > 0:
         shown = " and ".join(f"{f:g}" for f in dict.fromkeys(lens.focal))
         raise ProblemError(f"{name}: {lens.label} has focal length {shown}, which must be positive")
-
-
-def _covariance(whitening: np.ndarray) -> np.ndarray | None:
-    if (whitening == np.eye(2)).all():
-        return None
-    root = np.linalg.inv(whitening)
-    covariance = root @ root.transpose(0, 2, 1)
-    return 0.5 * (covariance + covariance.transpose(0, 2, 1))
 
 
 def checked_pose(record: Record, rotation: np.ndarray, center: list[float]) -> Pose:
@@ -155,7 +137,7 @@ def part(document: Record, key: str, program: str) -> Record:
     document.fail(f"has no {key}, only {', '.join(there) or 'other parts'}: have {program} write its whole result")
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused
 def build(
     path: StrPath,
     views: Mapping[int, tuple[int, Any]],
@@ -195,7 +177,7 @@ def build(
     of_cameras = [views[key][1] for key in names.tolist()]
     used = list(dict.fromkeys(sorted(of_cameras)))
     rotations, centers = (np.array(parts) for parts in zip(*(poses[pose] for pose in owner), strict=True))
-    return assemble(
+    return _assemble(
         path,
         [lens(key) for key in used],
         np.array([used.index(key) for key in of_cameras]),

@@ -94,7 +94,7 @@ def _lens(model: str, data: Record) -> ForeignLens:
     x, y = data.get("principal_point").vector(2)
     fisheye = model == "fisheye"
     distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
-    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, size=size)
+    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, size)
 
 
 def _landmarks(structure: Record) -> Iterator[Landmark]:

@@ -79,7 +79,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     seen, unused = _read_tracks(_tracks_beside(path), shots, landmarks)
     note_unused(path, document.unknown(PARTS) | _unused(document, path) | unused)
     for (image, track), (x, y) in seen.items():
-        width, height = lenses[views[shots[image]][1]].size or (0.0, 0.0)
+        width, height = lenses[views[shots[image]][1]].size
         landmarks[track][1].append(shots[image])
         landmarks[track][2].append([max(width, height) * x + width / 2, max(width, height) * y + height / 2])
     return build(path, views, poses, lenses, lenses.__getitem__, landmarks.values())
@@ -131,7 +131,7 @@ def _lens(camera: Record) -> ForeignLens:
         (width / 2 + side * offset[0], height / 2 + side * offset[1]),
         {name: optional(name) for name in names},
         model.startswith("fisheye"),
-        size=(width, height),
+        (width, height),
     )
 
 
