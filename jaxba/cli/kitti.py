@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -78,11 +77,8 @@ class EvaluateArguments:
     poses: Annotated[str | None, "FILE"] = None
     """True poses of the whole sequence, 12 numbers per line. Without them no errors are computed."""
 
-    lengths: Annotated[tuple[float, ...], "METRES ..."] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-    """Lengths of the segments for relative errors."""
-
     out: Annotated[str, "FOLDER"] = "runs/kitti"
-    """Folder of top-view.png, evaluation.json and the aligned trajectories."""
+    """Folder of evaluation.json and the aligned trajectories."""
 
 
 def main() -> None:
@@ -94,7 +90,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0 for success, 2 for bad input, 130 after Ctrl-C."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == [EVALUATE]:
-        text = "Computes trajectory errors and draws the scene from above."
+        text = "Computes trajectory errors."
         return common.run_command(EvaluateArguments, _evaluate, text, argv[1:], EVALUATE)
     text = "Makes a problem from KITTI images ('jaxba-kitti evaluate': compares solutions)."
     return common.run_command(Arguments, _build, text, argv)
@@ -120,10 +116,10 @@ def _build(args: Arguments) -> int:
     from jaxba.kitti.frontend import build
 
     console = common.console()
-    with common.notes_printed(), _progress(console) as report:
+    with common.notes_printed():
         sequence, poses = _inputs(args)
         _check_apart(sequence, args)
-        problem, frames, tracks = build(sequence, args, poses, report)
+        problem, frames, tracks = build(sequence, args, poses, console.print)
     _write(problem, frames, sequence, args)
     title = f"{len(sequence)} frames, {len(frames)} key-frames, {tracks} tracks"
     console.print(_build_table(title, problem, frames, poses))
@@ -189,35 +185,30 @@ def _build_table(title: str, problem: BundleProblem, frames: tuple[int, ...], po
 
 
 def _evaluate(args: EvaluateArguments) -> int:
-    common.require(bool(args.lengths) and all(length > 0 for length in args.lengths), "--lengths must be positive")
-    from jaxba.kitti import plots
-
     files, folder = [args.problem, *args.solutions], Path(args.out)
     names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
-    names += ["evaluation.json", "poses-truth.txt", "top-view.png"]
+    names += ["evaluation.json", "poses-truth.txt"]
     read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
     check_apart({"--out": [folder / name for name in names]}, read)
     side = read_sidecar(args.problem)
     truth = None if args.poses is None else poses_of(read_poses(args.poses), side.frames, side.calibration)
     with common.notes_printed():
-        results = evaluate.evaluate(files, side, truth, args.lengths)
-    ate = lambda row: f", ATE {row['ate_m']['rmse']:.2f} m" if "ate_m" in row else ""
-    views = [(row["name"] + ate(row), points, poses[:, :, 3]) for row, poses, points in results]
-    rows = [numbers for numbers, _, _ in results]
+        results = evaluate.evaluate(files, side, truth)
+    rows = [numbers for numbers, _ in results]
     contents = json.dumps({"frames": side.frames, "results": rows}, allow_nan=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "evaluation.json", contents + "\n")
-        for at, (numbers, poses, _) in enumerate(results):
+        for at, (numbers, poses) in enumerate(results):
             evaluate.write_poses(folder / f"poses-{at}-{numbers['name']}.txt", poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
-        plots.draw_top_view(folder / "top-view.png", views, None if truth is None else truth[:, :, 3])
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     console = common.console()
     console.print(_evaluate_table(rows, truth))
-    console.print(f"wrote {folder / 'top-view.png'} and {len(results) + (truth is not None) + 1} files beside it")
+    files_beside = common.counted(len(results) + (truth is not None), "file")
+    console.print(f"wrote {folder / 'evaluation.json'} and {files_beside} beside it")
     return 0
 
 
@@ -249,24 +240,3 @@ def _table(title: str, first: str, *columns: str) -> Any:
     for name in columns:
         table.add_column(name, justify="right")
     return table
-
-
-@contextmanager
-def _progress(console: Any) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on a terminal, else a line a stage: a function of the stage, what is done and the total."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task, now = bar.add_task("starting", total=None), ""
-
-        def report(stage: str, done: int, total: int) -> None:
-            nonlocal now
-            if stage != now:
-                now = stage
-                bar.reset(task, description=stage)
-                if not console.is_terminal:
-                    console.print(stage if total <= 1 else f"{stage} ({total})")
-            bar.update(task, completed=done, total=total)
-
-        yield report

@@ -1,3 +1,3 @@
 """From the images of a KITTI odometry sequence to a bundle adjustment problem, and trajectory errors of its solutions.
 
-Key-points, tracks and visual odometry need the extra `kitti` (OpenCV); trajectory errors and plots do not."""
+Key-points, tracks and visual odometry need the extra `kitti` (OpenCV); trajectory errors do not."""

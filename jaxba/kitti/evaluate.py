@@ -108,16 +108,12 @@ def _angles(poses: Poses) -> Float[np.ndarray, " poses"]:
     return np.rad2deg(Rotation.from_matrix(poses[:, :, :3]).magnitude())
 
 
-def score(
-    poses: Float[np.ndarray, "cameras 3 4"],
-    truth: Float[np.ndarray, "cameras 3 4"],
-    lengths: tuple[float, ...] = DEVKIT_LENGTHS,
-) -> dict[str, Any]:
+def score(poses: Float[np.ndarray, "cameras 3 4"], truth: Float[np.ndarray, "cameras 3 4"]) -> dict[str, Any]:
     """A trajectory's errors after alignment, metres and degrees. Raises ProblemError."""
     similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
     aligned = similarity.poses(poses)
     translation, rotation = relative_errors(aligned, truth)
-    segments = segment_errors(aligned, truth, lengths)
+    segments = segment_errors(aligned, truth)
     return {
         "scale": similarity.scale,  # metres per unit of the trajectory
         "ate_m": absolute_errors(aligned, truth)._asdict(),
@@ -131,10 +127,9 @@ def evaluate(
     paths: Sequence[StrPath],
     side: Sidecar,
     truth: Float[np.ndarray, "cameras 3 4"] | None,
-    lengths: tuple[float, ...] = DEVKIT_LENGTHS,
-) -> list[tuple[dict[str, Any], Float[np.ndarray, "cameras 3 4"], Float[np.ndarray, "points 3"]]]:
+) -> list[tuple[dict[str, Any], Float[np.ndarray, "cameras 3 4"]]]:
     """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
-    Returns of each: name, sizes, reprojection error and, with a truth, `score`; its aligned poses and points. Raises
+    Returns of each: name, sizes, reprojection error and, with a truth, `score`; and its aligned poses. Raises
     ProblemError: a file cannot be read, has other cameras than the sidecar file, or cannot be aligned."""
     results = []
     for path in paths:
@@ -142,14 +137,14 @@ def evaluate(
         if problem.num_cameras != len(side.frames):
             counts = f"{problem.num_cameras} cameras, the sidecar file names {len(side.frames)} frames"
             raise ProblemError(f"{display_name(path)}: has {counts}")
-        poses, points = geometry.camera_poses(problem.cameras), np.asarray(problem.points)
+        poses = geometry.camera_poses(problem.cameras)
         numbers = {
             "name": Path(strip_compression(path)).stem,
             "cameras": problem.num_cameras,
             "points": problem.num_points,
             "observations": problem.num_observations,
             "rms_px": float(np.sqrt(2 * geometry.cost(problem) / problem.num_observations)),
-            **({} if truth is None else score(poses, truth, lengths)),
+            **({} if truth is None else score(poses, truth)),
         }
         try:
             json.dumps(numbers, allow_nan=False)
@@ -161,7 +156,7 @@ def evaluate(
             similarity = Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
         else:
             similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
-        results.append((numbers, similarity.poses(poses), similarity.points(points)))
+        results.append((numbers, similarity.poses(poses)))
     return results
 
 

@@ -19,7 +19,7 @@ from jaxba.kitti.tracks import Tracks, choose, join_matches
 from jaxba.kitti.triangulate import views_of_poses
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-Report = Callable[[str, int, int], None]  # called with a stage, how much of it is done, and how much there is
+Report = Callable[[str], None]  # called with a stage when it begins
 
 
 def build(
@@ -40,12 +40,12 @@ def build(
     frames = tuple(numbers[i] for i in chosen)
     tracks, restarts = every.restrict(chosen), ()
     if options.start == "vo":
-        show = lambda done: report("visual odometry", done, len(frames))
-        views, restarts = visual_odometry(tracks, len(frames), sequence.calibration, options, frames, show)
+        report(f"visual odometry ({len(frames)})")
+        views, restarts = visual_odometry(tracks, len(frames), sequence.calibration, options, frames)
     else:
         assert poses_of_frames is not None
         views = views_of_poses(poses_of_frames(frames))
-    report("triangulation", 0, 1)
+    report("triangulation")
     whole = assemble(tracks, views, sequence.calibration, frames, options)
     for words, left in (
         ("left out, too few matches", sorted(set(sequence.numbers) - set(numbers))),
@@ -65,8 +65,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
     recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
     pixels: list[np.ndarray] = []
     matches: dict[tuple[int, int], np.ndarray] = {}
+    report(f"key-points and matches ({len(sequence)})")
     for j in range(len(sequence)):
-        report("key-points and matches", j, len(sequence))
         found, descriptors = detect(read(j), options.keypoints)
         pixels.append(found)
         recent.append(descriptors)

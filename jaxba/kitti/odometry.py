@@ -6,7 +6,6 @@ the angle between their rays is large enough. The first baseline has length 1. N
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import islice, pairwise
 from typing import NamedTuple
 
@@ -115,23 +114,21 @@ def visual_odometry(
     calibration: Calibration,
     options: Build,
     names: tuple[int, ...],
-    report: Callable[[int], None] = lambda done: None,
 ) -> tuple[Views, tuple[int, ...]]:
     """Poses of all views from tracks alone.
 
     The poses of views before the first pair with parallax (a car that stands still, or only rotates) are found last.
     The images of the tracks are the views, 0 to `views` - 1; `names` are their frame numbers, for messages, and
-    `options` has the limits for points. `report` is called with the number of views whose pose is known. Returns the
-    poses, the first view at the origin, and the views whose pose comes from the neighbouring view, for lack of known
-    points. Raises ProblemError: no pair of views has parallax, or a view shares too few tracks with its neighbour."""
+    `options` has the limits for points. Returns the poses, the first view at the origin, and the views whose pose comes
+    from the neighbouring view, for lack of known points. Raises ProblemError: no pair of views has parallax, or a view
+    shares too few tracks with its neighbour."""
     scene = _Scene(tracks, views, calibration, options)
     first, second, motion = _bootstrap(scene, views, names)
     scene.place(first, np.eye(3), np.zeros(3))
     scene.place(second, motion.rotation, motion.translation)
     restarts = []
     forward = [*range(first + 1, second), *range(second + 1, views)]
-    for done, view in enumerate([*forward, *range(first - 1, -1, -1)]):
-        report(done + 2)
+    for view in [*forward, *range(first - 1, -1, -1)]:
         pose = _resect(scene, view)
         if pose is None:
             pose = _pose_from_neighbour(scene, view, names)

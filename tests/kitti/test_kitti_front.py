@@ -146,27 +146,21 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     write_problem(exact.replace(cameras=cameras), out)
     assert solve([str(out), "--policy", "ceres", "--output", str(solved)]) == 0
     capsys.readouterr()
-    assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder), "--lengths", "2"]) == 0
+    assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder)]) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
     found = json.loads((folder / "evaluation.json").read_text())
     before, after = found["results"]
     assert after["ate_m"]["rmse"] < 0.5 * before["ate_m"]["rmse"]
     assert after["rms_px"] < before["rms_px"]
-    assert after["segments"]["segments"] == before["segments"]["segments"] > 0
     names = {
         "evaluation.json",
         "poses-0-p.txt",
         "poses-1-solved.txt",
         "poses-truth.txt",
-        "top-view.png",
     }
     assert {p.name for p in folder.iterdir()} == names
     np.testing.assert_allclose(np.loadtxt(folder / "poses-truth.txt"), np.loadtxt(poses), atol=1e-8)
-    picture = cv2.imread(str(folder / "top-view.png"))
-    red = (picture[..., 2] > 150) & (picture[..., 0] < 80) & (picture[..., 1] < 80)
-    assert red.sum() > 100  # the path
-    assert (picture.max(axis=2) < 100).sum() > 500  # the points
 
 
 def test_given_poses_are_the_start(rendered, tmp_path, capsys):
@@ -323,7 +317,6 @@ def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, caps
         ([str(out), str(tmp_path / "none.txt")], "No such file"),
         ([str(tmp_path / "none.txt")], "jaxba-kitti writes it"),
         ([str(out), "--poses", str(short)], "has 1 poses"),
-        ([str(out), "--lengths", "-1"], "--lengths must be positive"),
     ):
         assert run(["evaluate", *arguments, "--out", str(tmp_path / "e")]) == 2
         message = capsys.readouterr().err
