@@ -49,7 +49,7 @@ class Target:
 
     @property
     def key(self) -> str:
-        """Name in `summary.json`, e.g. `tau_0.001`."""
+        """Name in tables of numbers, e.g. `tau_0.001`."""
         return self.kind if self.kind == "converged" else f"{self.kind}_{self.value:g}"
 
     @property

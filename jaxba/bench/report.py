@@ -1,4 +1,4 @@
-"""Writes the results of a benchmark: a summary, and a page that needs no other file."""
+"""Writes the results of a benchmark: a page that needs no other file."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Any
 
 from jaxba.bench import page, profile
 from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
-from jaxba.bench.summary import Summary, summarize, write_summary
+from jaxba.bench.summary import Summary, summarize
 from jaxba.bench.tables import compact, details, reach_tables
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
-FILES = ("summary.json", "report.html")  # what `write_all` writes
+FILE = "report.html"  # what `write_report` writes
 
 
-def write_all(
+def write_report(
     records: Sequence[Record],
     out_dir: str | os.PathLike[str],
     tolerance: float = 1e-3,
     *,
     metadata: Mapping[str, Any] | None = None,
-) -> list[Path]:
-    """Writes `summary.json` and `report.html` into a folder, which it creates, over what is there; returns their paths.
+) -> Path:
+    """Writes `report.html` into a folder, which it creates, over what is there; returns its path.
 
     `tolerance` is tau of the performance profile; `metadata`, by default from the records, is shown on top: device,
     threads, versions and the like, and as code what has the name `command`. Raises ProblemError: there are no records,
@@ -36,11 +36,8 @@ def write_all(
         raise ProblemError(f"the tolerance must lie between 0 and 1, not {tolerance:g}")
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    summary = summarize(records, tolerance, metadata or run_metadata(records))
-    files = [folder / name for name in FILES]
-    write_summary(files[0], summary)
-    write_text(files[1], to_html(records, summary, tolerance))
-    return files
+    write_text(folder / FILE, to_html(records, summarize(records, tolerance), tolerance, metadata))
+    return folder / FILE
 
 
 def run_metadata(records: Iterable[Record]) -> dict[str, str]:
@@ -64,10 +61,12 @@ PROFILES = (
 RUNS = "The repeat of median time of each solver. Dashed: the tolerances."
 
 
-def to_html(records: Sequence[Record], summary: Summary, tolerance: float = 1e-3) -> str:
-    """The report as one HTML document that loads nothing (`page`). The arguments are those of `write_all`."""
+def to_html(
+    records: Sequence[Record], summary: Summary, tolerance: float = 1e-3, metadata: Mapping[str, Any] | None = None
+) -> str:
+    """The report as one HTML document that loads nothing (`page`). The arguments are those of `write_report`."""
     styles = solver_styles(profile.solver_names(records))
-    facts = {str(name): str(value) for name, value in summary.metadata.items()}
+    facts = {str(name): str(value) for name, value in (metadata or run_metadata(records)).items()}
     whole = page.Page("jaxba benchmark", facts, styles, AXES)
     names = profile.problem_names(records)
     if len(names) > 1:  # of one problem they say nothing

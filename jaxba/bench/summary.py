@@ -1,4 +1,4 @@
-"""Statistics of records, for each solver and for each pair of problem and solver, and `summary.json`.
+"""Statistics of records, for each solver and for each pair of problem and solver.
 
 A mean over the problems on which a target was reached is always given with the number k of these problems, out of all n
 problems of the benchmark. Iterations also have a capped mean over all n problems, in which a target that was not
@@ -6,24 +6,18 @@ reached counts as `ITERATION_LIMIT`, so that a solver cannot improve its mean by
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxba.bench import profile
 from jaxba.bench.profile import Target
 from jaxba.game.statistics import SHORTEST_TIME, Reached, capped, geometric_mean
-from jaxba.io import json_lines
-from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
-
-FORMAT = 2  # version of `summary.json`; it changes when a key changes its meaning
 
 
 class Cell(NamedTuple):
@@ -82,19 +76,18 @@ class ProblemSummary(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """The content of `summary.json` and of all tables."""
+    """The content of all tables."""
 
     targets: tuple[Target, ...]
     problems: list[ProblemSummary]
     solvers: list[SolverSummary]
     cells: list[Cell]
     warnings: list[str]
-    metadata: dict[str, Any] = field(default_factory=dict)  # device, threads, versions and the like
 
 
-def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapping[str, Any] | None = None) -> Summary:
+def summarize(records: Sequence[Record], tolerance: float = 1e-3) -> Summary:
     """Computes the statistics of all tables, from any number of records, also none. `tolerance` is tau of the target
-    `tau`; device, threads, versions and the like (`metadata`) are copied into the result."""
+    `tau`."""
     targets = (*profile.cost_targets(tolerance), Target("converged"))
     starts, bests = profile.initial_costs(records), profile.best_cost(records)
     tables = {target.key: profile.reach_table(records, target) for target in targets}
@@ -116,7 +109,6 @@ def summarize(records: Sequence[Record], tolerance: float = 1e-3, metadata: Mapp
         solvers=[_solver(solver, cells, found, len(names)) for solver in solvers],
         cells=cells,
         warnings=profile.cost_warnings(records) + [warning.format(*one, len(names)) for one in few.items()],
-        metadata=dict(metadata or {}),
     )
 
 
@@ -174,22 +166,3 @@ def _target(own: Reached) -> TargetSummary:
         iterations_capped=geometric_mean(capped(own.iterations, profile.ITERATION_LIMIT)),
         seconds=geometric_mean(own.seconds[reached], SHORTEST_TIME),
     )
-
-
-def to_json(summary: Summary) -> dict[str, Any]:
-    """The JSON object of `summary.json`. Non-finite numbers (never reached, unknown) become None."""
-    plain = (str, int, float, bool, type(None))
-    metadata = {str(name): x if isinstance(x, plain) else str(x) for name, x in summary.metadata.items()}
-    targets = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
-    rules = {
-        "iteration_limit": profile.ITERATION_LIMIT,
-        "zero_residual_floor": profile.ZERO_RESIDUAL_FLOOR,
-        "means": "geometric, over reached problems; iterations_capped over all problems",
-    }
-    body = json_lines.plain(replace(summary, metadata=metadata))
-    return {"format": FORMAT, "rules": rules, **body, "targets": targets}
-
-
-def write_summary(path: str | os.PathLike[str], summary: Summary) -> None:
-    """Writes `summary.json` atomically: a reader sees the old file or the complete new one. Raises OSError."""
-    write_text(path, json.dumps(to_json(summary), indent=1, allow_nan=False, ensure_ascii=False) + "\n")

@@ -122,7 +122,7 @@ def _check_apart(folder: Path, args: Arguments, jobs: Any) -> None:
     from jaxba.bench import report, run
     from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
 
-    names = (run.SETTINGS, run.RESULTS, *report.FILES)
+    names = (run.SETTINGS, run.RESULTS, report.FILE)
     problems = [one for job in jobs for one in problem_files(job.source.location)]
     policies = [policy_file(job.solver.policy) for job in jobs]
     read = {PROBLEM: problems, "a policy": policies, "the file of --suite": [args.suite]}
@@ -174,9 +174,9 @@ def _run_missing(
         status = common.INTERRUPTED
     if records:
         metadata = {"command": command, **report.run_metadata(records), **run.machine()}
-        report.write_all(records, folder, tolerance, metadata=metadata)
+        report.write_report(records, folder, tolerance, metadata=metadata)
         print_summary(summarize(records, tolerance), console)
-        say(f"every problem and run: {folder / 'report.html'}")
+        say(f"every problem and run: {folder / report.FILE}")
     return status
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from jaxba.bench import charts
 from jaxba.bench.profile import Target
-from jaxba.bench.report import run_metadata, to_html, write_all
+from jaxba.bench.report import run_metadata, to_html, write_report
 from jaxba.bench.summary import summarize
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.solver.record import Record, TracePoint
@@ -58,17 +58,17 @@ class Tags(HTMLParser):
 
 def page_of(records, tolerance=1e-3, **metadata):
     """The report: its text, its tags, and the data of its charts."""
-    text = to_html(records, summarize(records, tolerance, metadata=metadata), tolerance)
+    text = to_html(records, summarize(records, tolerance), tolerance, metadata)
     parser = Tags()
     parser.feed(text)
     assert parser.stack == []
     return text, parser, json.loads(parser.scripts[0])
 
 
-def test_write_all_writes_the_documented_files(tmp_path):
+def test_write_report_writes_one_file(tmp_path):
     records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
-    files = write_all(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
-    assert names(tmp_path / "out") == {"summary.json", "report.html"} == {path.name for path in files}
+    path = write_report(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
+    assert names(tmp_path / "out") == {"report.html"} == {path.name}
 
 
 def test_report_is_self_contained_well_formed_and_escaped():
@@ -131,15 +131,15 @@ def test_a_solver_has_one_colour_in_all_charts():
     ids=["no iteration", "all failed", "zeros", "log time"],
 )
 def test_unusual_results_still_make_a_report(tmp_path, records):
-    write_all(records, tmp_path)
+    write_report(records, tmp_path)
     assert "report.html" in names(tmp_path)
 
 
 def test_run_that_produced_no_numbers_still_makes_a_report(tmp_path):
     nothing = {"initial_cost": math.nan, "final_cost": math.nan, "iterations": 0, "accepted": 0, "trace": ()}
     crashed = replace(make_record("$x_1$ \u6f22", "_$policy$", 1, termination="error"), **nothing)
-    write_all([crashed], tmp_path / "alone")
-    write_all([crashed, make_record(crashed.problem, "x", 12)], tmp_path / "beside")
+    write_report([crashed], tmp_path / "alone")
+    write_report([crashed, make_record(crashed.problem, "x", 12)], tmp_path / "beside")
     text = (tmp_path / "alone" / "report.html").read_text(encoding="utf-8")
     assert "no solver has a finite initial cost" in text
 
@@ -184,7 +184,7 @@ def test_metadata_come_from_the_records_if_none_are_given():
 
 def test_nothing_to_report_and_bad_tolerance_are_refused(tmp_path):
     with pytest.raises(ProblemError, match="no results"):
-        write_all([], tmp_path / "out")
+        write_report([], tmp_path / "out")
     with pytest.raises(ProblemError, match="between 0 and 1"):
-        write_all([make_record("a", "x", 2)], tmp_path / "out", 1.5)
+        write_report([make_record("a", "x", 2)], tmp_path / "out", 1.5)
     assert not (tmp_path / "out").exists()
