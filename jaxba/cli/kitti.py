@@ -20,7 +20,7 @@ from jaxba.io import check_output, write_problem
 from jaxba.io.files import sidecar_path, strip_compression
 from jaxba.io.formats import FORMATS, by_ending
 from jaxba.io.frames import poses_of, read_poses, read_sidecar, write_sidecar
-from jaxba.io.notes import note, note_center
+from jaxba.io.notes import note_center
 from jaxba.kitti import evaluate
 from jaxba.kitti.evaluate import path_length
 from jaxba.kitti.options import Build
@@ -39,7 +39,7 @@ class Files:
     """What is read and written."""
 
     sequence: Annotated[str, "SEQUENCE", tyro.conf.Positional]
-    """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
+    """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt."""
 
     out: Annotated[str, "FILE"] = "kitti.txt.bz2"
     """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz); NAME.frames.json beside it has the frames."""
@@ -48,15 +48,14 @@ class Files:
     """Range of frame numbers, without the end, such as 0:200."""
 
     poses: Annotated[str | None, "FILE"] = None
-    """True poses, 12 numbers per line for every frame from 0, or 13, the first of them the frame. With --start vo only
-    the error of the start is computed from them."""
+    """True poses, 12 numbers per line for every frame from 0. With --start vo only the error of the start is computed
+    from them."""
 
     camera: int = 0
     """Number of the camera, from 0 (image_0 and P0) to 3."""
 
     calibration: Annotated[str | None, "FILE"] = None
-    """Camera matrix: lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers. Default: that of
-    the sequence."""
+    """Camera matrix: lines as in calib.txt, or 3 x 3 numbers. Default: that of the sequence."""
 
 
 @options
@@ -144,10 +143,6 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     poses = None
     if args.poses is not None:
         table = read_poses(args.poses)
-        if not table.one_a_line:
-            whole, sequence = len(sequence), sequence.only(table.numbers)
-            if len(sequence) < whole:
-                note(args.poses, f"{whole - len(sequence)} of {whole} frames left out: they have no pose")
         poses = lambda frames: poses_of(table, frames, sequence.calibration)
         poses(sequence.numbers)  # raises errors before any work is done
     center = (sequence.calibration.cx, sequence.calibration.cy)

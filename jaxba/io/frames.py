@@ -1,8 +1,7 @@
 """Frames of a sequence: text files of their poses, and the file beside a problem that says which frame each camera is.
 
-A line of poses has 12 numbers, a 3 x 4 matrix row by row; line 0 is frame 0 (KITTI's odometry benchmark). Lines of 13
-or 17 numbers begin with the frame and have 3 x 4 or 4 x 4 numbers (KITTI-360's `poses.txt`, `cam0_to_world.txt`);
-frames may be missing. Source: the readmes of both development kits."""
+A line of poses has 12 numbers, a 3 x 4 matrix row by row; line 0 is frame 0. Source: the readme of the development kit
+of KITTI's odometry benchmark."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxba.io.encoding import parse_json, plain_text, read_characters
 from jaxba.io.files import StrPath, display_name, open_output, reason, sidecar_path
@@ -23,44 +22,24 @@ from jaxba.problem.geometry import are_rotations
 
 
 class Poses(NamedTuple):
-    """Camera-to-world poses of frames."""
+    """Camera-to-world poses of all frames."""
 
-    numbers: Int[np.ndarray, " frames"]  # number of each frame, ascending
     matrices: Float[np.ndarray, "frames 3 4"]  # `[R | c]` of each, metres
     name: str  # of the file, for messages
-    one_a_line: bool = True  # whether lines are frames, so that none can be missing before the last
 
 
 def read_poses(path: StrPath) -> Poses:
-    """Poses of camera 0 to world, metres. Raises ProblemError: unreadable, malformed, no rotation, or a frame twice."""
+    """Poses of camera 0 to world, metres. Raises ProblemError: unreadable, malformed, or no rotation."""
     name = display_name(path)
     lines = lines_of(Path(path))
     if not lines:
         raise ProblemError(f"{name}: holds no poses")
-    width = len(lines[0][1].split())
-    width = width if width in (13, 17) else 12
-    table = np.array([numbers_of(line, width, f"{name} line {at}") for at, line in lines])
-    numbers, matrices = np.arange(len(table)), table
-    if width > 12:
-        whole = (table[:, 0] == np.floor(table[:, 0])) & (table[:, 0] >= 0) & (table[:, 0] < 2**31)
-        last = np.ones(len(table), bool) if width == 13 else (table[:, 13:] == [0, 0, 0, 1]).all(axis=1)
-        for bad, complaint in (
-            (~whole, "the first of 13 or 17 numbers is no number of a frame"),
-            (~last, "the last row of the matrix is not 0 0 0 1"),
-        ):
-            if bad.any():
-                raise ProblemError(f"{name} line {lines[bad.argmax()][0]}: {complaint}")
-        numbers, matrices = table[:, 0].astype(np.int64), table[:, 1:13]
-    poses = matrices.reshape(-1, 3, 4)
+    poses = np.array([numbers_of(line, 12, f"{name} line {at}") for at, line in lines]).reshape(-1, 3, 4)
     bad = np.flatnonzero(~are_rotations(poses[:, :, :3]))
     if bad.size:
         raise ProblemError(f"{name} line {lines[bad[0]][0]}: the left 3 x 3 numbers are no rotation")
-    order = np.argsort(numbers, kind="stable")
-    twice = np.flatnonzero(np.diff(numbers[order]) == 0)
-    if twice.size:
-        raise ProblemError(f"{name}: has two poses for frame {numbers[order][twice[0]]}")
-    u, _, vt = np.linalg.svd(poses[order, :, :3])  # to full precision
-    return Poses(numbers[order], np.concatenate([u @ vt, poses[order, :, 3:]], axis=2), name, width == 12)
+    u, _, vt = np.linalg.svd(poses[:, :, :3])  # to full precision
+    return Poses(np.concatenate([u @ vt, poses[:, :, 3:]], axis=2), name)
 
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
@@ -104,10 +83,10 @@ def poses_of(poses: Poses, numbers: tuple[int, ...], calibration: Calibration) -
     """Camera-to-world poses of this camera at the frames with these numbers.
 
     The centre of camera 0 is at `offset` in the camera's frame: paths differ. Raises ProblemError: no pose."""
-    there = np.isin(numbers, poses.numbers)
-    if not there.all():
-        raise ProblemError(f"{poses.name}: has {len(poses.numbers)} poses, none for frame {numbers[there.argmin()]}")
-    chosen = poses.matrices[np.searchsorted(poses.numbers, numbers)].copy()
+    if max(numbers) >= len(poses.matrices):
+        missing = next(number for number in numbers if number >= len(poses.matrices))
+        raise ProblemError(f"{poses.name}: has {len(poses.matrices)} poses, none for frame {missing}")
+    chosen = poses.matrices[list(numbers)]
     chosen[:, :, 3] -= chosen[:, :, :3] @ np.array(calibration.offset)
     return chosen
 

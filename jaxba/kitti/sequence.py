@@ -1,22 +1,19 @@
 """A KITTI sequence on disk: images and their calibration.
 
-Images are searched in `image_0` (odometry benchmark), `image_00/data` (raw data) and `image_00/data_rect` (KITTI-360).
-Calibration is read in the forms that KITTI's releases and their relatives have:
+Images are those of `image_0` to `image_3`, as in the odometry benchmark. Forms of the calibration:
 
 | file | lines |
 | --- | --- |
 | `calib.txt` of the odometry benchmark | `P0: 12 numbers` to `P3:` |
 | the same without names | 12 numbers each; the first line is P0, that of the left grey camera |
-| `calib_cam_to_cam.txt` of the raw data, `perspective.txt` of KITTI-360 | `P_rect_00: 12 numbers` to `P_rect_03:` |
 | `K.txt` | a 3 x 3 matrix, or one of 3 x 4 |
 
-Source: Geiger et al. 2012, "Are we ready for autonomous driving?", 2013, "Vision meets robotics"; Liao et al. 2022,
-"KITTI-360"; the readmes of the development kits."""
+Source: Geiger et al. 2012, "Are we ready for autonomous driving?"; the readme of the development kit."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +23,12 @@ from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.frames import Calibration, lines_of, numbers_of
 from jaxba.problem.bundle_problem import ProblemError
 
-FILES = ("calib.txt", "K.txt", "calib_cam_to_cam.txt", "perspective.txt")  # in the order of the search
-ABOVE = ("calib_cam_to_cam.txt",)  # also searched in the folder above: raw data have one for all drives of a day
+FILES = ("calib.txt", "K.txt")  # in the order of the search
 
 
 def calibration_files(folder: Path) -> list[Path]:
     """Where the calibration of a sequence's folder may be, in the order of the search."""
-    return [folder / name for name in FILES] + [folder.absolute().parent / name for name in ABOVE]
+    return [folder / name for name in FILES]
 
 
 def read_calibration(path: StrPath, camera: int = 0) -> Calibration:
@@ -57,10 +53,9 @@ def _matrix(lines: list[str], name: str, camera: int) -> Float[np.ndarray, "3 4"
     """The matrix P of a camera from the lines of a file."""
     if any(":" in line for line in lines):
         rows = {key.strip(): rest for key, _, rest in (line.partition(":") for line in lines)}
-        keys = (f"P{camera}", f"P_rect_{camera:02d}")
-        key = next((key for key in keys if key in rows), None)
-        if key is None:
-            raise ProblemError(f"{name}: has no line {keys[0]}: or {keys[1]}:")
+        key = f"P{camera}"
+        if key not in rows:
+            raise ProblemError(f"{name}: has no line {key}:")
         return numbers_of(rows[key], 12, f"{name} {key}").reshape(3, 4)
     widths = {len(line.split()) for line in lines}
     if widths == {12}:
@@ -93,15 +88,6 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def only(self, numbers: np.ndarray) -> Sequence:
-        """The frames with these numbers. Raises ProblemError: fewer than two are left."""
-        kept = np.flatnonzero(np.isin(self.numbers, numbers))
-        if len(kept) < 2:
-            raise ProblemError(f"{display_name(self.folder)}: {len(kept)} of its frames have a pose, not 2")
-        return replace(
-            self, numbers=tuple(self.numbers[at] for at in kept), images=tuple(self.images[at] for at in kept)
-        )
-
 
 def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibration: StrPath | None = None) -> Sequence:
     """The frames of a range. No image is opened yet. Hidden files, such as a Mac's `._000000.png`, are no images. The
@@ -111,9 +97,9 @@ def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibrati
     root, name = Path(folder), display_name(folder)
     if not root.is_dir():
         raise ProblemError(f"{name}: no such folder")
-    images = _images_folder(root, camera)
-    if images is None:
-        raise ProblemError(f"{name}: has no folder image_{camera} or image_{camera:02d}/data{_other_camera(root)}")
+    images = root / f"image_{camera}"
+    if not images.is_dir():
+        raise ProblemError(f"{name}: has no folder image_{camera}{_other_camera(root)}")
     found = _image_files(images)
     if not found:
         raise ProblemError(f"{display_name(images)}: holds no images ({', '.join(SUFFIXES)}){_other_camera(root)}")
@@ -133,13 +119,6 @@ def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibrati
     )
 
 
-def _images_folder(root: Path, camera: int) -> Path | None:
-    """Folder of a camera's images, in the layout of any release; the first that holds images, if one does."""
-    raw = root / f"image_{camera:02d}"
-    there = [place for place in (root / f"image_{camera}", raw / "data", raw / "data_rect", raw) if place.is_dir()]
-    return next((place for place in there if _image_files(place)), there[0] if there else None)
-
-
 def _image_files(folder: Path) -> list[Path]:
     """Images in a folder, without hidden files."""
     return [path for path in visible(folder) if path.suffix.lower() in SUFFIXES]
@@ -147,11 +126,11 @@ def _image_files(folder: Path) -> list[Path]:
 
 def _other_camera(root: Path) -> str:
     """A hint at the cameras that have images, as the end of a message."""
-    there = [(one, folder) for one in CAMERAS if (folder := _images_folder(root, one)) and _image_files(folder)]
+    there = [one for one in CAMERAS if (root / f"image_{one}").is_dir() and _image_files(root / f"image_{one}")]
     if not there:
         return ""
-    names = " and ".join(str(folder.relative_to(root)) for _, folder in there)
-    return f"; images are in {names}: use --camera {' or '.join(str(one) for one, _ in there)}"
+    names = " and ".join(f"image_{one}" for one in there)
+    return f"; images are in {names}: use --camera {' or '.join(map(str, there))}"
 
 
 def _range(frames: str, name: str, count: int) -> range:

@@ -400,18 +400,6 @@ def test_hidden_files_change_nothing(rendered, sequence, tmp_path):
     assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
 
 
-def test_frames_without_a_pose_are_left_out_and_counted(sequence, tmp_path, capsys):
-    rows = (sequence / "poses.txt").read_text().splitlines()
-    numbered = [f"{at} {row}" for at, row in enumerate(rows) if at not in (3, 7)]
-    (sequence / "poses.txt").write_text("\n".join(numbered))
-    assert build(sequence, tmp_path / "a.txt", "--start", "poses", "--keyframes", "all") == 0
-    assert (
-        f"note: {sequence / 'poses.txt'}: 2 of {FRAMES} frames left out: they have no pose" in capsys.readouterr().out
-    )
-    frames = json.loads((tmp_path / "a.frames.json").read_text())["frames"]
-    assert frames == [at for at in range(FRAMES) if at not in (3, 7)]
-
-
 def test_a_principal_point_at_the_edge_of_the_image_is_noted(sequence, tmp_path, capsys):
     calibration = sequence / "calib.txt"
     calibration.write_text("P0: 210 0 0 0 0 210 0 0 0 0 1 0\n")
