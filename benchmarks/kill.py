@@ -28,7 +28,7 @@ from jaxba.training import checkpoint, log
 from jaxba.training.driver import CHECKPOINTS, CONFIG
 
 SETTINGS = [
-    *("chunks=48", "evaluate_every=4", "checkpoint_every=1", "envs=8"),
+    *("chunks=48", "evaluate_every=1", "envs=8"),
     *("bank.kind={cameras: 4, points: 12, family: paper}", "bank.scenes=160", "bank.refine_points=0"),
     *("game.max_iterations=12", "game.agent.refine_points=0", "game.agent.trials=1", "game.agent.camera_rounds=0"),
     "game.agent.pattern_moves=0",

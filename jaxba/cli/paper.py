@@ -10,8 +10,7 @@ from typing import Any
 from jaxba.cli import common
 from jaxba.cli.options import options
 
-FULL, FAST = "full", "fast"
-"""Names of the presets."""
+FULL = "full"  # the preset that is run if none is named
 
 REPORT = "paper.md"  # file of the report, unless `--report` names another
 
@@ -20,11 +19,8 @@ REPORT = "paper.md"  # file of the report, unless `--report` names another
 class Arguments:
     """Options of `jaxba-paper`."""
 
-    fast: bool = False
-    """Fewer seeds and shorter trainings: the preset fast."""
-
-    config: str | None = None
-    """A preset (full, fast) or the path of a YAML file."""
+    config: str = FULL
+    """A preset (full; fast: fewer seeds and shorter trainings) or the path of a YAML file."""
 
     only: tuple[str, ...] = ()
     """Names of the tables and figures to compute; default: all. The report has the others from earlier results."""
@@ -63,20 +59,17 @@ def _paper(args: Arguments) -> int:
         for entry in TABLES_AND_FIGURES.values():
             console.print(f"{entry.name:12} {entry.title}")
         return 0
-    if args.fast and args.config:
-        raise common.UsageError("--fast is --config fast; give one of them")
     for name in args.only:
         if name not in TABLES_AND_FIGURES:
             raise common.UsageError(f"--only {name}: unknown; known: {', '.join(TABLES_AND_FIGURES)}")
-    name = args.config or (FAST if args.fast else FULL)
-    config = configs.load(name)
-    stem = Path(name).stem
+    config = configs.load(args.config)
+    stem = Path(args.config).stem
     folder = Path(args.out or Path("runs") / ("paper" if stem == FULL else f"paper-{stem}"))
     report = Path(args.report or folder / REPORT)
     common.require(report.suffix != ".html", "--report is a Markdown file; the page of figures lies beside it")
     check_apart(
         {"--report": [report, report.with_suffix(".html")], "--out": [folder / CLAIMS]},
-        {"the file of --config": [find("paper", name)]},
+        {"the file of --config": [find("paper", args.config)]},
     )
     _open(folder, config)
     common.check_writable("--report", str(report))
@@ -128,7 +121,6 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
             console.print("interrupted; what is done is kept, run the same command again to continue")
             status = common.INTERRUPTED
         # the command without paths of this machine
-        chosen = " --fast" if args.fast else f" --config {Path(args.config).name}" if args.config else ""
-        files = write(runner, report, f"jaxba-paper{chosen}")
+        files = write(runner, report, f"jaxba-paper --config {Path(args.config).name}")
     console.print(f"wrote {', '.join(str(file) for file in files)}")
     return status

@@ -97,7 +97,8 @@ def _train(args: Arguments, command: str) -> int:
     config = _prepare(args, folder, name)
     common.prepare_process()
     console = common.console(FILE_WIDTH, markup=False)
-    with process.single_blas_thread(), Interrupt("chunk", graceful=False) as interrupt, _Stages(console) as stages:
+    with process.single_blas_thread(), Interrupt("chunk", graceful=False) as interrupt:
+        stages = _Stages(console)
         try:
             with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
                 loops: list[Any] = []
@@ -138,29 +139,16 @@ def _train(args: Arguments, command: str) -> int:
 
 
 class _Stages:
-    """Prints every stage of the work with its seconds once it has ended; a terminal shows the one that goes on."""
+    """Prints every stage of the work with its seconds once it has ended."""
 
     def __init__(self, console: Any) -> None:
-        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._task, self._print = self._bar.add_task("starting"), console.print
-        self._text, self._begun = "starting", time.perf_counter()
-
-    def __enter__(self) -> _Stages:
-        self._bar.start()
-        return self
+        self._print, self._text, self._begun = console.print, "starting", time.perf_counter()
 
     def __call__(self, text: str) -> None:
         """Ends the stage before, and begins another one."""
         now = time.perf_counter()
         self._print(f"{self._text}: {now - self._begun:.1f} s")
         self._text, self._begun = text, now
-        self._bar.reset(self._task, description=text)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:

@@ -105,9 +105,7 @@ def train(
     rounds = -(-steps // env.num_envs)
     chunks = min(EVALUATIONS, rounds)
     loop = replace(env.preset.loop, steps_per_chunk=-(-rounds // chunks))
-    config = replace(
-        env.preset, seeds=seeds, seed=seed, chunks=chunks, evaluate_every=1, checkpoint_every=chunks, loop=loop
-    )
+    config = replace(env.preset, seeds=seeds, seed=seed, chunks=chunks, evaluate_every=1, loop=loop)
     work = Task(config, env, env.held_out, {})
     show = lambda rows: print(_line(rows, chunks), flush=True)
     hooks = driver.Hooks(rows=show) if verbose else driver.Hooks()

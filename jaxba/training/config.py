@@ -43,10 +43,8 @@ class TrainConfig:
     """Length of each agent's training in calls of the compiled loop, each of `loop.steps_per_chunk` vector steps."""
 
     evaluate_every: int = 4
-    """Chunks between evaluations on held-out scenes; the last chunk is always followed by one."""
-
-    checkpoint_every: int = 4
-    """Chunks between checkpoints, of which the last two are kept. Each also holds the best policy so far."""
+    """Chunks between evaluations, each followed by a checkpoint, of which the last two are kept; the last chunk has
+    both. A checkpoint also holds the best policy so far."""
 
     envs: int = 64
     """Environments that step together."""
@@ -84,7 +82,7 @@ class TrainConfig:
         return method.options(plain)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "envs"):
+        for name in ("seeds", "chunks", "evaluate_every", "envs"):
             check_count(name, getattr(self, name), 1)
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 to 2147483647, not {self.seed}")

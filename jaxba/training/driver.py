@@ -33,7 +33,7 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 
 _METADATA = ("chunk", "wall_s", "evaluated", "best")  # what a checkpoint holds besides arrays
-CHANGEABLE = ("chunks", "checkpoint_every")  # settings that a resumed run may change
+CHANGEABLE = "chunks"  # the setting that a resumed run may change
 KEPT = 2  # checkpoints: of a damaged one the one before is left
 SCORE = "training/score"  # the metric by which policies are chosen: lower is better
 
@@ -86,10 +86,9 @@ def prepare_folder(
             raise TrainError(f"{folder} holds no run to resume")
         old = load(str(path))
         new = config or load(str(path), overrides)
-        changed = [key for key in settings.differences(old, new) if key not in CHANGEABLE]
+        changed = [key for key in settings.differences(old, new) if key != CHANGEABLE]
         if changed:
-            free = ", ".join(CHANGEABLE)
-            raise TrainError(f"{folder} was begun with another {changed[0]}; a resumed run may change {free}")
+            raise TrainError(f"{folder} was begun with another {changed[0]}; a resumed run may change {CHANGEABLE}")
         config = new
     if config is None:
         raise AssertionError("a new run needs a configuration")
@@ -216,10 +215,9 @@ class _Run:
 
     def finish(self) -> Outcome:
         """Trains the remaining chunks."""
-        config = self.config
-        while self.chunk < config.chunks:
+        while self.chunk < self.config.chunks:
             stopping = self._advance()
-            if stopping or self.chunk % config.checkpoint_every == 0 or self.chunk == config.chunks:
+            if stopping or self.evaluated == self.chunk:
                 self._save()
             if stopping:
                 return Outcome(False, self.best, self.state)

@@ -174,7 +174,7 @@ def test_a_folder_below_a_file_is_refused_before_the_work(tmp_path):
         ("solve", "--log", f"{tmp_path}/file/out.json"),
         ("bench", "scene:tiny:1", "--solvers", "ceres", "--out", f"{tmp_path}/file/run"),
         ("train", "--config", "default", "--out", f"{tmp_path}/file/run"),
-        ("paper", "--fast", "--out", f"{tmp_path}/file/run"),
+        ("paper", "--config", "fast", "--out", f"{tmp_path}/file/run"),
     ):
         child = begin(command, *arguments)
         printed, error = child.communicate(timeout=100)

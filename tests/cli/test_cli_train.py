@@ -21,7 +21,7 @@ from jaxba.training.config import load
 from jaxba.typing import InputError
 
 TINY = [
-    *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=8"),
+    *("chunks=4", "evaluate_every=1", "envs=8"),
     *("bank.kind={cameras: 4, points: 12, family: paper}", "bank.scenes=160", "bank.refine_points=0"),
     "game.max_iterations=12",
     *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),

@@ -20,7 +20,6 @@ agents:
   overrides:
     - chunks=1
     - evaluate_every=1
-    - checkpoint_every=1
     - envs=8
     - "bank.kind={cameras: 4, points: 12, family: paper}"
     - bank.scenes=160
@@ -139,13 +138,12 @@ def test_a_folder_of_another_run_is_refused(finished, tmp_path, capsys):
 
 def test_wrong_arguments_are_one_line(capsys, tmp_path):
     assert "--only tables: unknown; known: kitti, bal" in error_of(capsys, "--only", "tables")
-    assert "give one of them" in error_of(capsys, "--fast", "--config", "full")
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text("seeds: 3")
     assert "unknown key seeds" in error_of(capsys, "--config", str(wrong), "--out", str(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     missing = str(tmp_path / "none" / "paper.md")
-    assert "does not exist" in error_of(capsys, "--fast", "--out", str(tmp_path / "run"), "--report", missing)
+    assert "does not exist" in error_of(capsys, "--config", "fast", "--out", str(tmp_path / "run"), "--report", missing)
 
 
 def test_list_prints_all_tables_and_figures(capsys):

@@ -28,7 +28,6 @@ from jaxba.training.train_loop import LoopConfig
 CONFIG = TrainConfig(
     chunks=6,
     evaluate_every=2,
-    checkpoint_every=2,
     sac=SacConfig(width=8, batch=16),
     loop=LoopConfig(replay_capacity=300, warmup_steps=16, steps_per_chunk=5),
 )
@@ -255,7 +254,7 @@ def test_nothing_to_resume(tmp_path):
 
 
 def test_a_resumed_run_may_not_become_another(whole):
-    with pytest.raises(TrainError, match=r"another sac\.width; a resumed run may change chunks, checkpoint_every"):
+    with pytest.raises(TrainError, match=r"another sac\.width; a resumed run may change chunks"):
         prepare_folder(whole[0], None, True, ("sac.width=9",))
     with pytest.raises(TrainError, match="begun with another seed"):
         prepare_folder(whole[0], dataclasses.replace(CONFIG, seed=1), True)
