@@ -21,7 +21,8 @@ BYTES_IN_PARTS = 420.0
 """The same of a process that computes in parts (sharded.py), with the problem. Measured: 370 on a scene of the size of
 Final-13682, `python -m benchmarks.growth --sizes 28988`."""
 
-SINGLE = 0.6  # share of it in float32
+BYTES_OF_PROGRAM = 0.7e9  # of Python, JAX and the compilation of a step
+SINGLE = 0.6  # share in float32 of what is not that
 
 ITERATIONS = 10  # of a solve, assumed
 LONG_S = 10.0  # seconds of a solve that is announced
@@ -34,10 +35,10 @@ class Estimate(NamedTuple):
     """Number of observations."""
 
     memory: float
-    """Bytes of a device in float64, or of this process on a CPU."""
+    """Bytes that the observations take on a device in float64, or in this process on a CPU."""
 
     available: float
-    """Bytes that it has; infinite if that is not known."""
+    """Bytes that it has for them; infinite if that is not known."""
 
     iteration_s: float
     """Seconds of an iteration on a machine like that of `choose.SECONDS`."""
@@ -80,7 +81,8 @@ def estimate(
     chosen = amounts.get(options.linear_solver, amounts["implicit"])
     if np.isfinite(on_gpu):
         return Estimate(count, each * count / devices, on_gpu, seconds(chosen))
-    return Estimate(count, each * count / jax.process_count(), process.memory(), seconds(chosen))
+    available = process.memory() - BYTES_OF_PROGRAM
+    return Estimate(count, each * count / jax.process_count(), available, seconds(chosen))
 
 
 def device_memory() -> float:

@@ -10,7 +10,7 @@ import jaxba
 from jaxba import ProblemError, SolveOptions, StepOptions
 from jaxba.runtime import process
 from jaxba.solver import estimate as module
-from jaxba.solver.estimate import BYTES_IN_PARTS, BYTES_PER_OBSERVATION, SINGLE, estimate
+from jaxba.solver.estimate import BYTES_IN_PARTS, BYTES_OF_PROGRAM, BYTES_PER_OBSERVATION, SINGLE, estimate
 
 IMPLICIT = StepOptions(linear_solver="implicit")
 
@@ -19,13 +19,13 @@ def test_observations_that_a_device_cannot_hold_are_refused_with_the_arithmetic(
     problem = support.tiny()
     needed = BYTES_PER_OBSERVATION * problem.num_observations
     message = r"observations take some .* GB in float64 and .* in float32, and there are .*: take float32"
-    for patched, where in ((module, "device_memory"), (process, "memory")):
+    for patched, where, more in ((module, "device_memory", 0), (process, "memory", BYTES_OF_PROGRAM)):
         with monkeypatch.context() as patch:
-            patch.setattr(patched, where, lambda: needed - 1)
+            patch.setattr(patched, where, lambda more=more: needed + more - 1)
             with pytest.raises(ProblemError, match=message):
                 jaxba.solve(problem, options=SolveOptions(max_iterations=0))
             estimate(problem, IMPLICIT).check(single=True)
-            patch.setattr(patched, where, lambda: SINGLE * needed - 1)
+            patch.setattr(patched, where, lambda more=more: SINGLE * needed + more - 1)
             with pytest.raises(ProblemError, match=message):
                 estimate(problem, IMPLICIT).check(single=True)
     monkeypatch.setattr(module, "device_memory", lambda: needed - 1)
