@@ -6,13 +6,13 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
-from functools import cache, partial
+from dataclasses import dataclass, field, is_dataclass, make_dataclass
+from functools import cache
 from io import StringIO
 from itertools import pairwise
-from types import MappingProxyType, NoneType, UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import tyro
@@ -73,11 +73,7 @@ def _metavar(kind: Any) -> str | None:
 
 
 def parse(
-    arguments: type[Arguments],
-    description: str,
-    program: str,
-    argv: Sequence[str] | None,
-    defaults: Mapping[str, Any] = MappingProxyType({}),
+    arguments: type[Arguments], description: str, program: str, argv: Sequence[str] | None
 ) -> Arguments | str | None:
     """The parsed command line, or what is wrong with it, in one line; None after `--help`.
 
@@ -85,16 +81,11 @@ def parse(
         arguments: the class of the options.
         description: first line of the help.
         program: name of the command.
-        argv: the command line; `sys.argv[1:]` if None.
-        defaults: values by name of options that the command line may leave out, in place of the class's own. For a
-            class that inherits its options."""
+        argv: the command line; `sys.argv[1:]` if None."""
     groups = [base for base in arguments.__bases__ if is_dataclass(base)]
     # subclasses, without the docstrings, which tyro would print
-    parts = []
-    for base in groups:
-        part = type(base.__name__, (base,), {})
-        given = {one.name: defaults[one.name] for one in fields(base) if one.name in defaults}
-        parts.append((base.__name__.lower(), part, field(default_factory=partial(part, **given) if given else part)))
+    made = [type(base.__name__, (base,), {}) for base in groups]
+    parts = [(part.__name__.lower(), part, field(default_factory=part)) for part in made]
     drawn = StringIO()
     try:
         with redirect_stderr(drawn):

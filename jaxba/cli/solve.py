@@ -9,7 +9,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,7 +17,7 @@ import tyro
 from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import surveyed
-from jaxba.cli.options import options, parse
+from jaxba.cli.options import options
 from jaxba.cli.output import check_outputs, check_storable, fitting, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
@@ -156,9 +155,6 @@ class Step:
     """quick: compile in a third of the time, and iterate two to six times as long. full: the contrary. auto: full once
     that pays; on a GPU always."""
 
-    settings: Annotated[str | None, "FILE"] = None
-    """YAML file of options of this command. The command line wins."""
-
 
 @options
 class Stop:
@@ -242,27 +238,7 @@ def run(argv: Sequence[str] | None = None) -> int:
         words = translated(sys.argv[1:] if argv is None else argv)
     except common.UsageError as error:
         return common.print_error(str(error))
-    main = lambda args: _run(args if args.settings is None else with_settings(args.settings, words))
-    return common.run_command(Arguments, main, "Bundle adjustment of a problem, or of several.", words)
-
-
-def with_settings(path: str, words: Sequence[str]) -> Arguments:
-    """The arguments of a command line where what it leaves out is as a file of `--settings` says. Raises UsageError: no
-    such file, or it has what is no option, or no value of it; one line that names the file."""
-    from jaxba import settings
-    from jaxba.settings import configurations
-
-    try:
-        data = {str(key).replace("-", "_"): value for key, value in configurations.read_file(Path(path), path).items()}
-        if none := {"problem", "more", "settings"} & set(data):
-            raise configurations.SettingsError(f"{path}: {none.pop()} stands on the command line alone")
-        given = settings.read(Arguments, data)
-    except configurations.SettingsError as error:
-        text = str(error)
-        raise common.UsageError(f"--settings {text if text.startswith(path) else f'{path}: {text}'}") from None
-    parsed = parse(Arguments, "", "jaxba-solve", words, {name: getattr(given, name) for name in data})
-    assert isinstance(parsed, Arguments)  # as without the file
-    return parsed
+    return common.run_command(Arguments, _run, "Bundle adjustment of a problem, or of several.", words)
 
 
 def solver_name(args: Arguments) -> SolverName:
@@ -368,8 +344,8 @@ def _solve(args: Arguments) -> int:
     run = _iterate if args.recipes is None else _by_recipes
     solution, steps = run(args, problem, policy, options, watch)
     common.print_line(table.summary(problem, solution, options.loss))
-    if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
-        common.print_line(table.padding(problem, solution))
+    if solution.capacity is not None:
+        common.print_line(f"padded to {solution.capacity}")
     found = survey.report(solution)
     if found.rows:
         common.print_line(str(found))
@@ -408,8 +384,7 @@ def _checked(args: Arguments) -> tuple[str | None, Survey]:
     common.require(named, f"--record {args.record}: a recording ends in .npz")
     outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
     outputs["--survey"] = args.survey
-    read = {f"the file of --{name}": getattr(args, name) for name in ("constraints", "settings")}
-    read["the file of --policy"] = policy_file(args.policy)
+    read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
     check_outputs(args.output, outputs, path, read)
     if args.view:
         common.check_extra(view.VIEWER)

@@ -21,7 +21,6 @@ from jaxba.problem.preprocess import MIN_TRACK, observed
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
 from jaxba.solver.solve import Solution
-from jaxba.structure.padding import capacity_of
 
 if TYPE_CHECKING:
     from jaxba.results.retriangulate import Retriangulation
@@ -168,21 +167,6 @@ def lost_in(problem: BundleProblem, model: bool) -> str:
         "weights of observations": problem.whitening is not None,
     }
     return ", ".join(what for what, is_lost in lost.items() if is_lost)
-
-
-def padding(problem: BundleProblem, solution: Solution) -> str:
-    """The sizes to which a problem was padded, or why it was not."""
-    if solution.capacity is not None:
-        return f"padded to {solution.capacity}"
-    if problem.lenses is not None:
-        why = "the problem has shared or partly constant lenses"
-    elif problem.constants is not None or problem.residuals or problem.rigs is not None:
-        why = "the problem has constants, priors or rigs"
-    elif capacity_of(problem) is None:
-        why = "the problem is too large"
-    else:
-        why = "that is for the explicit linear solver"
-    return f"note: not padded: {why}"
 
 
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:

@@ -24,7 +24,6 @@ from jaxba import (
     random_scene,
     random_scene_with_truth,
 )
-from jaxba.cli import table
 from jaxba.cli.solve import run
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem import geometry
@@ -265,7 +264,6 @@ def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common()
 def test_padding_leaves_lenses_as_they_are():
     solution = solve(shared(), "ceres", pad=True)
     assert solution.capacity is None
-    assert table.padding(shared(), solution) == "note: not padded: the problem has shared or partly constant lenses"
 
 
 @pytest.mark.parametrize("method", ["deeplm", "stba"])
