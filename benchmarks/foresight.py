@@ -40,7 +40,7 @@ from jaxba.cli.common import prepare_process
 from jaxba.damping.agent_config import AgentConfig, embedded
 from jaxba.damping.features import observe
 from jaxba.damping.guard import action_of
-from jaxba.damping.learned import AgentPolicy, ConstantAction
+from jaxba.damping.learned import AgentPolicy, LearnedPolicy, always
 from jaxba.game.env import Episode, Game, GameConfig, make_game
 from jaxba.game.evaluate import best_constant_action
 from jaxba.game.random_scenes import SceneClass
@@ -282,7 +282,7 @@ class Predicted(AgentPolicy):
         return self.actions[jnp.where(change[best] < -self.margin, best, 0)]
 
 
-def fit(labels: Labels, base: ConstantAction, actions: Float[np.ndarray, "tries actions"], seed: int) -> Any:
+def fit(labels: Labels, base: LearnedPolicy, actions: Float[np.ndarray, "tries actions"], seed: int) -> Any:
     """The policy of the predicted advantages, and R2 of each action's on the scenes of the other folds."""
     x = labels.seen
     change = np.log(labels.iterations / labels.iterations[:, :1]).astype(np.float32)
@@ -310,7 +310,7 @@ def fit(labels: Labels, base: ConstantAction, actions: Float[np.ndarray, "tries 
     margin = min(MARGINS, key=paid)
     spread = np.maximum(change[:, 1:].var(axis=0), 1e-9)
     explained = 1 - ((beyond - change)[:, 1:] ** 2).mean(axis=0) / spread
-    all_actions = jnp.concatenate([jnp.asarray([base.action], jnp.float32), jnp.asarray(actions, jnp.float32)])
+    all_actions = jnp.concatenate([base.act(jnp.asarray(labels.seen[0]))[None], jnp.asarray(actions, jnp.float32)])
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *networks)
     numbers = (jnp.asarray(mean), jnp.asarray(scale), all_actions, jnp.float32(margin))
     return Predicted(stacked, *numbers, base.config), explained
@@ -328,8 +328,9 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     key = jax.random.key(args.seed)
     split = make_split(bank_config, key, bank_config.options, rules.max_iterations, say, rules.tolerance)
     say(f"{len(split.train.initial_cost)} scenes, {len(split.held_out.initial_cost)} held out")
-    base = best_constant_action(kind, split.train, rules, options)
-    say(f"base: action {base.action[0]:.2f}")
+    constant = best_constant_action(kind, split.train, rules, options)
+    base = always(constant, agent)
+    say(f"base: action {constant:.2f}")
     actions = np.array([[action_of(agent, jnp.float32(decades))] for decades in DECADES]).clip(-1, 1)
     game = lambda bank: make_game(rules, kind, bank, 1, bank_config.options)
     labels = collect(game(split.train), base, actions, args.seed)
@@ -342,7 +343,7 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
         taken[name], _ = look_ahead(game(split.held_out), one, actions, looks)
         say(f"{name}: {np.exp(np.log(taken[name]).mean()):.2f} iterations")
     shown = lambda name: "{:.3f} [{:.3f}, {:.3f}]".format(*paired_ratio(taken[name], taken["base"]))
-    damping = 10 ** (0.5 * (agent.low + agent.high) + 0.5 * (agent.high - agent.low) * base.action[0])
+    damping = 10 ** (0.5 * (agent.low + agent.high) + 0.5 * (agent.high - agent.low) * constant)
     source = f"{len(args.problems)} problems" if args.problems else "random"
     count = f"{len(split.train.initial_cost)} + {len(split.held_out.initial_cost)}"
     mean = f"{np.exp(np.log(taken['base']).mean()):.2f}"

@@ -1,4 +1,4 @@
-"""Policies that act as an agent does, through the guard: a trained network, and one and the same action always."""
+"""Policies that act as an agent does, through the guard: a trained network, or one and the same action always."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import Memory, begin, observation_size, observe, record
-from jaxba.damping.guard import GuardState, damping_of, initial_guard, update_guard
+from jaxba.damping.guard import damping_of
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
@@ -52,37 +52,6 @@ class AgentPolicy(ABC):
         return memory, damping_of(self.config, memory.guard, action[0])
 
 
-@register_pytree
-@dataclass(frozen=True)
-class ConstantAction(AgentPolicy):
-    """The same action in every iteration: what the guard alone achieves, without a network.
-
-    The best constant action of a game is the baseline that training has to beat."""
-
-    action: tuple[float]  # in [-1, 1]
-    config: AgentConfig = field(metadata={"static": True})  # what the action means
-
-    def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
-        """The action, whatever the observation."""
-        return jnp.asarray(self.action, jnp.float32)
-
-    def init(self, info: ProblemInfo) -> tuple[GuardState, Float[Array, ""]]:
-        """See `DampingPolicy`."""
-        return self._allowed(initial_guard(self.config, info.cost.dtype))
-
-    def propose(self, state: GuardState, step: StepInfo) -> tuple[GuardState, Float[Array, ""]]:
-        """See `DampingPolicy`."""
-        return self._allowed(update_guard(self.config, state, step))
-
-    def _allowed(self, guard: GuardState) -> tuple[GuardState, Float[Array, ""]]:
-        return guard, damping_of(self.config, guard, jnp.asarray(self.action, jnp.float32)[0])
-
-
-def boldest(config: AgentConfig) -> ConstantAction:
-    """The policy that always asks for the smallest lambda."""
-    return ConstantAction((-1.0,), config)
-
-
 class Layer(NamedTuple):
     """`x W + b`."""
 
@@ -112,10 +81,15 @@ class LearnedPolicy(ArrayRecord, AgentPolicy):
         return jnp.tanh(outputs[: outputs.shape[0] // 2])
 
 
+SATURATED = 20.0  # its hyperbolic tangent is 1 in float32
+
+
 def always(action: float, config: AgentConfig) -> LearnedPolicy:
-    """The same action in every state, as a network of one layer without weights: so that it can be a policy file."""
-    inside = 1 - np.finfo(np.float32).eps  # where arctanh is finite
-    bias = np.array([np.arctanh(np.clip(action, -inside, inside)), 0], np.float32)
+    """The same action in every state, as a network of one layer without weights: what the guard alone achieves. The
+    best one of a game is the baseline that training has to beat."""
+    inside = np.tanh(SATURATED / 2)
+    before = np.arctanh(action) if abs(action) < inside else np.copysign(SATURATED, action)
+    bias = np.array([before, 0], np.float32)
     return LearnedPolicy((Layer(np.zeros((observation_size(config), 2), np.float32), bias),), config)
 
 

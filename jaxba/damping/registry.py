@@ -16,7 +16,7 @@ from typing import Any
 
 from jaxba.damping.agent_config import embedded
 from jaxba.damping.default_policy import Guarded
-from jaxba.damping.learned import ConstantAction, boldest
+from jaxba.damping.learned import LearnedPolicy, always
 from jaxba.damping.policy import DampingPolicy, check_policy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
@@ -29,9 +29,9 @@ SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
 """File of `learned`, trained with the preset of `jaxba-train` that has its name."""
 
 
-def bold() -> ConstantAction:
+def bold() -> LearnedPolicy:
     """The smallest lambda that the guard of agents allows, in every iteration, and all embedded iterations."""
-    return boldest(embedded())
+    return always(-1.0, embedded())
 
 
 POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.damping import ConstantAction, DampingPolicy
+from jaxba.damping import DampingPolicy
+from jaxba.damping.learned import always
 from jaxba.game.env import GameConfig
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, alike, play
@@ -78,11 +79,12 @@ def best_constant_action(
     rules: GameConfig,
     options: StepOptions,
     beside: Mapping[str, tuple[DampingPolicy, StepOptions]] | None = None,
-) -> ConstantAction:
+) -> float:
     """The constant action with the fewest mean iterations: what an agent must beat to have learned something. The bank
     is that of training; `beside` are policies that are played, too, so that all share programs."""
-    tried = {str(action): ConstantAction((action,), rules.agent) for action in CONSTANT_ACTIONS}
-    steps = alike({**(beside or {}), **{name: (one, options) for name, one in tried.items()}})
+    tried = {str(action): action for action in CONSTANT_ACTIONS}
+    own = {name: (always(action, rules.agent), options) for name, action in tried.items()}
+    steps = alike({**(beside or {}), **own})
     mean = lambda name: evaluate(kind, bank, *steps[name], rules.tolerance, rules.max_iterations).mean
     return tried[min(tried, key=mean)]
 

@@ -123,7 +123,7 @@ def best_constant(config: PaperConfig, agent: Agent, folder: Path, report: Calla
         bank = task.first_scenes(played.bank, work.held_out)
         found = best_constant_action(played.kind, bank, played.config, played.options)
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_policy(path, always(found.action[0], found.config))
+        save_policy(path, always(found, played.config.agent))
     return path
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import LearnedPolicy, boldest, learned_from
+from jaxba.damping.learned import LearnedPolicy, always, learned_from
 from jaxba.damping.registry import BOLD, LEARNED
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
@@ -145,7 +145,7 @@ def _baseline_runs(
     if CONSTANT in names:
         bank = first_scenes(game.bank, held_out)
         found = best_constant_action(game.kind, bank, config.game, game.options, policies)
-        policies[CONSTANT] = found, game.options
+        policies[CONSTANT] = always(found, config.game.agent), game.options
     runs = play_all(game.kind, held_out, policies, config.game.max_iterations)  # in the order of the table
     arrays = {f"{name}/{field}": x for name, run in runs.items() for field, x in run._asdict().items()}
     checkpoint.write_arrays(path, arrays)
@@ -159,7 +159,7 @@ def baseline_policies(
     as in `BASELINES`, without `CONSTANT`; the rule that belongs to the method comes first."""
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     found = {name: (make_policy(name), config.step_options) for name in (*own, *names)}
-    return found | ({BOLD: (boldest(config.game.agent), options)} if BOLD in found else {})
+    return found | ({BOLD: (always(-1.0, config.game.agent), options)} if BOLD in found else {})
 
 
 def _write_split(path: Path, split: Split) -> None:

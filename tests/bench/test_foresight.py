@@ -11,7 +11,7 @@ import pytest
 from tiny_game import AGENT, KIND, RULES, tiny_bank
 
 from benchmarks.foresight import look_ahead, play_on
-from jaxba.damping.learned import ConstantAction
+from jaxba.damping.learned import always
 from jaxba.game.env import make_game
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import reach
@@ -20,7 +20,7 @@ from jaxba.problem.options import StepOptions
 pytestmark = pytest.mark.slow
 
 CONFIG = replace(AGENT, lens_step="file")
-POLICY = ConstantAction((0.0,), CONFIG)
+POLICY = always(0.0, CONFIG)
 ACTIONS = np.array([[-0.8], [0.0], [0.6]])
 
 
@@ -53,6 +53,6 @@ def test_it_takes_no_more_than_its_base_and_fewer_somewhere(game, alone):
 def test_its_first_numbers_are_those_of_the_whole_episodes(game, alone):
     """The base policy's own action leads to what it takes alone."""
     bank = game.bank
-    found = jax.jit(lambda scene: play_on(game, bank, POLICY, jnp.asarray([POLICY.action]), game.start(bank, scene)))
+    found = jax.jit(lambda scene: play_on(game, bank, POLICY, jnp.zeros((1, 1)), game.start(bank, scene)))
     for scene in range(3):
         assert found(jnp.asarray(scene, jnp.int32))[0] == alone[0][scene]

@@ -15,7 +15,7 @@ from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin, observation_size
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, always
+from jaxba.damping.learned import LearnedPolicy, always
 from jaxba.damping.policy_file import save_policy
 from jaxba.solver.names import parse_solver
 
@@ -51,7 +51,7 @@ def test_bolds_lambda_is_the_smallest_of_all_that_the_guard_allows():
         allowed = [float(damping_of(config, state.guard, wish)) for wish in wishes]
         assert float(damping) == min(allowed)
         state = after(config, state, accepted, float(jnp.log10(damping)))
-        damping = damping_of(config, state.guard, policy.act(jnp.zeros(1))[0])
+        damping = damping_of(config, state.guard, policy.act(jnp.zeros(observation_size(policy.config)))[0])
 
 
 def test_bold_falls_by_the_descent_to_the_lowest_and_rises_after_a_rejection():
@@ -59,20 +59,25 @@ def test_bold_falls_by_the_descent_to_the_lowest_and_rises_after_a_rejection():
     state = begin(policy.config, info())
     found = []
     for accepted in (ACCEPTED,) * 4 + (REJECTED, ACCEPTED):
-        found.append(float(jnp.log10(damping_of(policy.config, state.guard, policy.act(jnp.zeros(1))[0]))))
+        found.append(
+            float(
+                jnp.log10(
+                    damping_of(policy.config, state.guard, policy.act(jnp.zeros(observation_size(policy.config)))[0])
+                )
+            )
+        )
         state = after(policy.config, state, accepted, found[-1])
     np.testing.assert_allclose(found, [-5, -6.5, -8, -9, -9, -8.5], atol=1e-6)
 
 
 def test_an_action_between_the_bounds_is_played_as_it_is():
     config = AgentConfig(guard="off", low=-10.0, high=2.0)
-    found = solve(hard_scene(), ConstantAction((0.25,), config), SolveOptions(max_iterations=5))
+    found = solve(hard_scene(), always(0.25, config), SolveOptions(max_iterations=5))
     np.testing.assert_allclose(np.log10(found.history.damping), -2.5, rtol=1e-6)
 
 
 def test_bold_has_the_step_of_rules_with_embedded_iterations():
     policy, options = parse_solver("bold").build()
-    assert isinstance(policy, ConstantAction)
     assert options.step_options(policy) == policy.step_options(StepOptions())
     assert options.step_options(policy) == parse_solver("ceres+embedded").build()[1].step_options(make_policy("ceres"))
 

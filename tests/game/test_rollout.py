@@ -14,7 +14,7 @@ from tiny_game import AGENT, KIND, grid, problem_of, tiny_bank
 
 from jaxba import StepOptions, make_method, make_policy
 from jaxba.damping.features import observation_size
-from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
+from jaxba.damping.learned import Layer, LearnedPolicy, always
 from jaxba.game.env import GameConfig
 from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
 from jaxba.game.random_scenes import (
@@ -215,10 +215,9 @@ def test_the_best_constant_action_has_the_fewest_iterations():
     bank = tiny_bank()
     best = best_constant_action(KIND, bank, GameConfig(AGENT, max_iterations=LIMIT), StepOptions())
     means = [
-        evaluate(KIND, bank, ConstantAction((action,), AGENT), StepOptions(), 1e-3, LIMIT).mean
-        for action in CONSTANT_ACTIONS
+        evaluate(KIND, bank, always(action, AGENT), StepOptions(), 1e-3, LIMIT).mean for action in CONSTANT_ACTIONS
     ]
-    assert means[CONSTANT_ACTIONS.index(best.action[0])] == min(means) < max(means)
+    assert means[CONSTANT_ACTIONS.index(best)] == min(means) < max(means)
 
 
 def test_policies_that_share_a_program_play_as_they_do_alone():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from jaxba import make_policy
-from jaxba.damping.learned import boldest
+from jaxba.damping.learned import always
 from jaxba.training.config import load
 from jaxba.training.task import BASELINES, CONSTANT, baseline_policies
 
@@ -29,7 +29,7 @@ def test_rules_and_what_ships_have_plain_steps_on_the_games_unknowns():
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_bold_has_the_guard_and_the_step_of_the_game(preset):
     config, options, policies = found(preset, "game.agent.escalate=0.75")
-    assert policies["bold"] == (boldest(config.game.agent), options)
+    assert policies["bold"] == (always(-1.0, config.game.agent), options)
     assert policies["bold"][0].config.escalate == 0.75
 
 
