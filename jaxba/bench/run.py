@@ -113,12 +113,10 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
 
 
-def open_folder(
-    folder: Path, settings: RunSettings, jobs: Sequence[Job], command: str = "", alone: bool = False
-) -> list[Record]:
+def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job], command: str = "") -> list[Record]:
     """Creates the folder, or continues a benchmark in it. Writes the settings and the command. Returns the records that
-    the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, of another
-    command if that must be `alone`, or results of other problems or policies (by checksum) under the same names."""
+    the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, or
+    results of other problems or policies (by checksum) under the same names."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
@@ -137,8 +135,7 @@ def open_folder(
             known_files = dict(previous.pop("files", {}))  # absent in folders of older versions
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
-        changed = ["command"] if alone and previous.get("command") != command else []
-        changed += [key for key, value in asdict(settings).items() if previous.get(key, value) != value]
+        changed = [key for key, value in asdict(settings).items() if previous.get(key, value) != value]
         changed += [name for name, file in current["problems"].items() if used(name) and known.get(name, file) != file]
         changed += [name for name, digest in files.items() if used(name) and known_files.get(name, digest) != digest]
         if changed:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import glob
 import itertools
@@ -21,9 +20,6 @@ from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "ceres,ceres+refine3,guarded,classic"
 """Ceres' rule, without and with embedded point iterations, the default policy, and the paper's rule."""
-
-DEFAULT_OUT = "runs/bench"
-"""Folder of the first benchmark whose folder is not given; that of the next is called `runs/bench-2`."""
 
 WIDTH = 100  # width of the table in characters
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)  # A variable that `os.path.expandvars` expands
@@ -61,9 +57,9 @@ class Arguments:
     strict: bool = False
     """Fail instead of skipping invalid parts of the input."""
 
-    out: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_OUT})")] = None
-    """Folder of the results. A second run with the same folder does only what is missing. Default: the first of
-    runs/bench, runs/bench-2, ... that holds nothing, or this command's results."""
+    out: str = "runs/bench"
+    """Folder of the results. A second run with the same folder does only what is missing; one with other settings needs
+    another folder."""
 
 
 def main() -> None:
@@ -95,26 +91,12 @@ def _bench(args: Arguments, command: str) -> int:
     jobs = run.plan(problems, solvers, repeats)
     settings = run.RunSettings(max_iterations, args.linear_solver, pad=not args.problems)
     try:
-        folder, done = _open(args, jobs, settings, command)
+        folder = Path(args.out)
+        _check_apart(folder, args, jobs)
+        done = run.open_folder(folder, settings, jobs, command)
         return _run_missing(folder, done, jobs, settings, tolerance, args.strict, command)
     except OSError as error:
-        raise common.UsageError(f"--out {args.out or DEFAULT_OUT}: {error.strerror or error}") from None
-
-
-def _open(args: Arguments, jobs: Any, settings: Any, command: str) -> tuple[Path, Any]:
-    from jaxba.bench import run
-    from jaxba.problem.bundle_problem import ProblemError
-
-    folder = Path(args.out or DEFAULT_OUT)
-    if args.out is not None:
-        _check_apart(folder, args, jobs)
-        return folder, run.open_folder(folder, settings, jobs, command)
-    for number in itertools.count(2):
-        _check_apart(folder, args, jobs)
-        with contextlib.suppress(ProblemError):  # of another command, or a file has changed since, or is damaged
-            return folder, run.open_folder(folder, settings, jobs, command, alone=True)
-        folder = Path(f"{DEFAULT_OUT}-{number}")
-    raise AssertionError
+        raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
 
 
 def _check_apart(folder: Path, args: Arguments, jobs: Any) -> None:

@@ -212,15 +212,13 @@ def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undra
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
 
 
-def test_another_command_gets_a_folder_of_its_own_and_the_same_one_goes_on(tmp_path, undrawn, capsys, monkeypatch):
+def test_without_a_folder_results_are_gathered_in_one(undrawn, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    brief, places = ["scene:tiny", "--repeats", "1", "--max-iterations", "1", "--solvers"], Path("runs")
+    brief = ["scene:tiny", "--repeats", "1", "--max-iterations", "2", "--solvers"]
     assert run([*brief, "ceres"]) == run([*brief, "classic"]) == run([*brief, "ceres"]) == 0
-    assert [line["solver"] for line in lines(places / "bench")] == ["ceres"]
-    assert [line["solver"] for line in lines(places / "bench-2")] == ["classic"]
-    (places / "bench" / "results.jsonl").write_text("damaged\n")
-    assert run([*brief, "ceres"]) == 0
-    assert [line["solver"] for line in lines(places / "bench-3")] == ["ceres"]
+    assert [line["solver"] for line in lines(tmp_path / "runs" / "bench")] == ["ceres", "classic"]
+    assert run([*brief[:-2], "3", "--solvers", "ceres"]) == 2
+    assert "holds a run with another max_iterations; give another --out" in capsys.readouterr().err
 
 
 def test_the_default_scenes_share_programs():
