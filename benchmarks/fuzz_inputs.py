@@ -64,15 +64,10 @@ def _views() -> list[tuple[int, int, float, float]]:
     return list(zip(SCENE.camera_index.tolist(), SCENE.point_index.tolist(), *pixels.T.tolist(), strict=True))
 
 
-def _poses() -> tuple[np.ndarray, np.ndarray]:
-    """Rotations and translations with z to the front and y down."""
-    flip = np.diag([1.0, -1.0, -1.0])
-    return flip @ np.asarray(geometry.rotation_matrices(SCENE.cameras[:, :3])), np.asarray(SCENE.cameras[:, 3:6]) @ flip
-
-
 def _opensfm(folder: Path) -> None:
-    _, translations = _poses()
-    rotations = _turned()
+    flip = np.diag([1.0, -1.0, -1.0])  # z to the front and y down
+    rotations = np.asarray(geometry.angle_axis(flip @ np.asarray(geometry.rotation_matrices(SCENE.cameras[:, :3]))))
+    translations = np.asarray(SCENE.cameras[:, 3:6]) @ flip
     lens = {"projection_type": "perspective", "width": 1000, "height": 800, "focal": 0.7, "k1": 0.0, "k2": 0.0}
     shots = {
         f"{i}.jpg": {"camera": "a", "rotation": r.tolist(), "translation": t.tolist()}
@@ -84,56 +79,6 @@ def _opensfm(folder: Path) -> None:
     )
     rows = [f"{i}.jpg\t{j}\t{k}\t{x / 1000}\t{y / 1000}\t1\t2\t3" for k, (i, j, x, y) in enumerate(_views())]
     (folder / "tracks.csv").write_text("\n".join(rows) + "\n")
-
-
-def _turned() -> np.ndarray:
-    """Angle-axis vectors of `_poses`."""
-    return np.asarray(geometry.angle_axis(_poses()[0]))
-
-
-def _openmvg(folder: Path) -> None:
-    rotations, translations = _poses()
-    centers = -np.einsum("nji,nj->ni", rotations, translations)
-    view = {"width": 1000, "height": 800, "id_intrinsic": 0}
-    views = [
-        {"key": i, "value": {"ptr_wrapper": {"data": {**view, "filename": f"{i}.jpg", "id_view": i, "id_pose": i}}}}
-        for i in range(len(rotations))
-    ]
-    lens = {"width": 1000, "height": 800, "focal_length": 700.0, "principal_point": [500.0, 400.0]}
-    named = {"polymorphic_id": 2147483649, "polymorphic_name": "pinhole", "ptr_wrapper": {"id": 1, "data": lens}}
-    poses = [
-        {"key": i, "value": {"rotation": r.tolist(), "center": c.tolist()}}
-        for i, (r, c) in enumerate(zip(rotations, centers, strict=True))
-    ]
-    seen: dict[int, list] = {}
-    for i, j, x, y in _views():
-        seen.setdefault(j, []).append({"key": i, "value": {"id_feat": 1, "x": [x + 500, y + 400]}})
-    structure = [
-        {"key": j, "value": {"X": SCENE.points[j].tolist(), "observations": of}} for j, of in sorted(seen.items())
-    ]
-    contents = {"sfm_data_version": "0.3", "views": views, "intrinsics": [{"key": 0, "value": named}]}
-    (folder / "a.json").write_text(json.dumps({**contents, "extrinsics": poses, "structure": structure}))
-
-
-def _alicevision(folder: Path) -> None:
-    rotations, translations = _poses()
-    centers = -np.einsum("nji,nj->ni", rotations, translations)
-    text = lambda numbers: [repr(x) for x in np.ravel(numbers).tolist()]
-    views = [
-        {"viewId": str(i), "poseId": str(i), "intrinsicId": "0", "path": f"{i}.jpg"} for i in range(len(rotations))
-    ]
-    lens = {"intrinsicId": "0", "width": "1000", "height": "800", "type": "pinhole", "pxFocalLength": ["700", "700"]}
-    lens |= {"distortionParams": "", "principalPoint": ["500", "400"]}
-    poses = [
-        {"poseId": str(i), "pose": {"transform": {"rotation": text(r.T), "center": text(c)}}}
-        for i, (r, c) in enumerate(zip(rotations, centers, strict=True))
-    ]
-    seen: dict[int, list] = {}
-    for i, j, x, y in _views():
-        seen.setdefault(j, []).append({"observationId": str(i), "featureId": "1", "x": text([x + 500, y + 400])})
-    structure = [{"landmarkId": str(j), "X": text(SCENE.points[j]), "observations": of} for j, of in seen.items()]
-    contents = {"version": ["1", "2", "0"], "views": views, "intrinsics": [lens], "poses": poses}
-    (folder / "a.sfm").write_text(json.dumps({**contents, "structure": structure}))
 
 
 def _kitti(folder: Path) -> None:
@@ -197,8 +142,6 @@ INPUTS = (
     _solved("COLMAP, binary", lambda folder: _colmap(folder, binary=True), "model", 6),
     _solved("COLMAP, text", _colmap, "model", 6),
     _solved("OpenSfM", _opensfm, "reconstruction.json", 2),
-    _solved("OpenMVG", _openmvg, "a.json", 2),
-    _solved("AliceVision", _alicevision, "a.sfm", 2),
     Input(
         "KITTI",
         _kitti,

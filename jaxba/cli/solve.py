@@ -69,8 +69,8 @@ class Problem:
     """What is solved."""
 
     problem: Annotated[str | None, "[PROBLEM]", tyro.conf.Positional] = None
-    """BAL, Bundler, OpenSfM, OpenMVG or AliceVision file, also .bz2, .gz, .xz; folder of a COLMAP model; a downloaded
-    BAL problem (see jaxba-data); - for standard input. Default: a scene."""
+    """BAL, Bundler or OpenSfM file, also .bz2, .gz, .xz; folder of a COLMAP model; a downloaded BAL
+    problem (see jaxba-data); - for standard input. Default: a scene."""
 
     more: Annotated[tuple[str, ...], "[PROBLEM ...]", tyro.conf.Positional] = ()
     """Further problems; a folder stands for those in it."""

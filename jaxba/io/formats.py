@@ -13,8 +13,9 @@ from jaxba.io.colmap import is_colmap, read_colmap
 from jaxba.io.colmap.model import PARTS, RIG_PARTS
 from jaxba.io.encoding import plain_text
 from jaxba.io.files import StrPath, beginning, display_name, strip_compression
-from jaxba.io.foreign import RECONSTRUCTION, TRACKS
+from jaxba.io.json_records import read_json
 from jaxba.io.nerfstudio import check_transforms, write_transforms
+from jaxba.io.opensfm import RECONSTRUCTION, TRACKS, from_document, recognises
 from jaxba.io.ply import write_ply
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
@@ -35,19 +36,16 @@ class Format:
 
 
 def _read_json(path: StrPath) -> BundleProblem:
-    """Reads OpenSfM's, OpenMVG's or AliceVision's file, which are told apart by their contents."""
-    from jaxba.io.foreign import alicevision, json_records, openmvg, opensfm
-
-    document = json_records.read_json(path)
-    for program in (opensfm, openmvg, alicevision):
-        if program.recognises(document):
-            return program.from_document(document, path)
+    """Reads OpenSfM's file; of another program it says what to give."""
+    document = read_json(path)
+    if recognises(document):
+        return from_document(document, path)
     frames = document.value.get("frames") if isinstance(document.value, dict) else None
     if isinstance(frames, list) and any(isinstance(one, dict) and "transform_matrix" in one for one in frames):
         document.fail(
             "is nerfstudio's transforms.json, which has poses but no points: give the COLMAP model it was made from"
         )
-    document.fail(f"is JSON, but not of a program that is known here; {formats_read()}")
+    document.fail(f"is JSON, but not OpenSfM's: have its program write a COLMAP model; {formats_read()}")
 
 
 TRANSFORMS = Format("nerfstudio's cameras", (".json",), write=write_transforms, check=check_transforms)
@@ -55,7 +53,7 @@ TRANSFORMS = Format("nerfstudio's cameras", (".json",), write=write_transforms, 
 FORMATS = (
     Format("BAL", (".txt", ".bal"), read_bal, write_bal, check_bal_lenses),
     Format("Bundler", (".out",), read_bundler, write_bundler, check_bal_lenses, (b"# Bundle file",)),
-    Format("OpenSfM, OpenMVG or AliceVision", (".json", ".sfm"), _read_json, begins=(b"{", b"[")),
+    Format("OpenSfM", (".json",), _read_json, begins=(b"{", b"[")),
     Format("PLY", (".ply",), write=write_ply),
     TRANSFORMS,
 )
@@ -64,7 +62,7 @@ FORMATS = (
 OTHER_ENDINGS = (
     *(".7z", ".abc", ".bin", ".csv", ".dae", ".db", ".fbx", ".g2o", ".glb", ".gltf", ".graph", ".h5", ".hdf5"),
     *(".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mvs", ".npy", ".npz", ".nvm"),
-    *(".obj", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".psx", ".pt", ".py", ".rar", ".safetensors", ".sql"),
+    *(".obj", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".psx", ".pt", ".py", ".rar", ".safetensors", ".sfm", ".sql"),
     *(".sqlite", ".stl", ".tar", ".tbz2", ".tgz", ".tif", ".toml", ".tsv", ".txz", ".usd", ".vtk", ".xml"),
     *(".xyz", ".yaml", ".yml", ".z", ".zip", ".zst"),
 )
@@ -94,9 +92,8 @@ def ending(path: StrPath) -> str:
 
 
 def by_ending(path: StrPath, *, written: bool = False) -> Format | None:
-    """The format that a name's ending stands for; of two the one that is `written`, or else read."""
-    found = [one for one in FORMATS if ending(path) in one.endings]
-    return next((one for one in found if one.write or not written), found[0] if found else None)
+    """The format that a name's ending stands for; the one that is `written`, or else the first."""
+    return next((one for one in FORMATS if ending(path) in one.endings and (one.write or not written)), None)
 
 
 def is_file_name(path: StrPath) -> bool:
@@ -163,9 +160,8 @@ def writer(path: StrPath) -> Writer:
     known = by_ending(path, written=True)
     write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
     if write is None:
-        of = f" of {known.name}" if known else ""
         name = display_name(path)
-        raise ProblemError(f"cannot write {name}: files{of} with {ending(path)} are not written; {formats_written()}")
+        raise ProblemError(f"cannot write {name}: files with {ending(path)} are not written; {formats_written()}")
     return write
 
 

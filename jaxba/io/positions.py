@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name, reason
-from jaxba.io.foreign.json_records import Record, read_json
+from jaxba.io.json_records import Record, read_json
 from jaxba.io.nerfstudio import IMAGES
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import ProblemError

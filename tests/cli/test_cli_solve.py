@@ -482,10 +482,6 @@ BAD = {
         "no does not exist",
     ),
     "gain ratio that no step exceeds": (lambda tiny: [str(tiny), "--min-gain", "1"], "--min-gain must be at least 0"),
-    "output that would be read as AliceVision's": (
-        lambda tiny: [str(tiny), "--output", "o.sfm"],
-        "cannot write o.sfm: files of OpenSfM, OpenMVG or AliceVision",
-    ),
     "compressed output of another format": (
         lambda tiny: [str(tiny), "--output", "o.zip.gz"],
         "cannot write o.zip.gz: files with .zip",

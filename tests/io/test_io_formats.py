@@ -9,7 +9,7 @@ import tarfile
 import numpy as np
 import pytest
 import support
-from foreign_scene import Lens, Scene, write_openmvg
+from foreign_scene import Lens, Scene, write_opensfm
 
 from jaxba.cli.solve import run
 from jaxba.io import check_output, formats, read_problem, write_colmap, write_problem
@@ -68,17 +68,17 @@ def test_a_name_whose_ending_says_nothing_is_bal_and_that_is_said(tiny, capsys):
 
 
 def test_what_readers_remark_is_printed_as_notes(tmp_path, capsys):
-    path = write_openmvg(tmp_path / "sfm_data.json", Scene([Lens(cx=0.0)], [0, 0, 0]), ["pinhole"])
+    path = write_opensfm(tmp_path, Scene([Lens(cx=0.0)], [0, 0, 0]), ["simple_radial"])
     assert run([str(path), "--max-iterations", "1", "--output", str(tmp_path / "a.txt")]) == 0
     printed = capsys.readouterr()
-    assert printed.out.startswith(f"note: {path}: the principal point of intrinsic 0 lies at the edge")
+    assert printed.out.startswith(f"note: {path}: the principal point of camera v2 maker 0 lies at the edge")
     assert "note: that file cannot store: which images share a lens, which numbers of a lens are" in printed.out
     assert printed.err == ""
 
 
 def test_what_is_remarked_is_refused_if_asked(tmp_path):
-    path = write_openmvg(tmp_path / "sfm_data.json", Scene([Lens(cx=0.0)], [0, 0, 0]), ["pinhole"])
-    with pytest.raises(ProblemError, match=r"sfm_data\.json: the principal point of intrinsic 0 lies at the edge"):
+    path = write_opensfm(tmp_path, Scene([Lens(cx=0.0)], [0, 0, 0]), ["simple_radial"])
+    with pytest.raises(ProblemError, match=r"reconstruction\.json: the principal point of camera v2 maker 0 lies"):
         read_problem(path, strict=True)
     assert run([str(path), "--strict", "--output", str(tmp_path / "a.txt")]) == 2
     assert not (tmp_path / "a.txt").exists()
@@ -87,10 +87,10 @@ def test_what_is_remarked_is_refused_if_asked(tmp_path):
 @pytest.mark.parametrize("name", ["model", "model.txt", "model.dat"])
 def test_a_file_is_recognised_by_its_first_bytes_where_the_name_says_nothing(tmp_path, name):
     scene = Scene([Lens(cx=800.0, cy=600.0)], [0, 0, 0])
-    json = read_problem(write_openmvg(tmp_path / "a.json", scene, ["pinhole"]))
+    json = read_problem(write_opensfm(tmp_path, scene, ["perspective"]))
     plain = support.tiny()
     write_problem(plain, tmp_path / "a.out")
-    for source, expected in (("a.json", json), ("a.out", plain)):
+    for source, expected in (("reconstruction.json", json), ("a.out", plain)):
         shutil.copy(tmp_path / source, tmp_path / name)
         np.testing.assert_allclose(read_problem(tmp_path / name).points, expected.points)
 
@@ -105,7 +105,7 @@ def test_what_is_not_read_names_what_is(tmp_path, content):
         read_problem(path)
     assert str(caught.value).isprintable()
     assert formats.formats_read() in str(caught.value)
-    for name in ("BAL", "Bundler", "OpenSfM", "OpenMVG", "AliceVision", "COLMAP"):
+    for name in ("BAL", "Bundler", "OpenSfM", "COLMAP"):
         assert name in str(caught.value)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import support
 from colmap_model import TextModel
-from foreign_scene import Lens, Scene, write_openmvg
+from foreign_scene import Lens, Scene, write_opensfm
 
 import jaxba
 from jaxba import ProblemError, read_colmap, write_transforms
@@ -119,8 +119,8 @@ def test_lenses_that_it_does_not_have_are_refused_before_the_solve(lines, messag
 
 
 def test_a_problem_in_a_json_file_is_not_replaced_by_its_cameras(tmp_path, capsys):
-    path = write_openmvg(tmp_path / "sfm_data.json", Scene([Lens(cx=800.0, cy=600.0)], [0, 0, 0]), ["pinhole"])
+    path = write_opensfm(tmp_path, Scene([Lens(cx=800.0, cy=600.0)], [0, 0, 0]), ["perspective"])
     before = path.read_bytes()
     assert run([str(path), "--output", str(path)]) == 2
-    assert "sfm_data.json" in capsys.readouterr().err
+    assert "reconstruction.json" in capsys.readouterr().err
     assert path.read_bytes() == before

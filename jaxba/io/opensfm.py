@@ -13,20 +13,17 @@ import numpy as np
 
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign import TRACKS
-from jaxba.io.foreign.cameras import ForeignLens, Landmark, build, checked_pose
-from jaxba.io.foreign.json_records import Record
+from jaxba.io.json_records import Record
 from jaxba.io.notes import note, note_unused
+from jaxba.io.opensfm_lenses import Lens, assemble, lens
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import are_rotations
 
+RECONSTRUCTION = "reconstruction.json"  # file by which a folder of OpenSfM is known
+TRACKS = tuple(f"tracks.csv{ending}" for ending in ("", ".gz", ".bz2", ".xz"))
 TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"  # begins the first line of tracks; files of version 0 have no such line
 FIELDS = {0: 8, 1: 9, 2: 11}  # fields of a line of tracks by version: image, track, key-point, x, y, ...
-
-_RADIAL = {"simple_radial": 1, "radial": 2, "brown": 3, "fisheye_opencv": 4}
-"""Models with two focal lengths and a principal point, and how many radial coefficients they have."""
-
-MODELS = ("perspective", "fisheye", *_RADIAL)  # camera models that are read
 
 PARTS = ("cameras", "shots", "points", "rig_cameras", "rig_instances", "biases", "reference_lla", "reference")
 """Parts of a reconstruction that are read, or that say nothing without measured positions."""
@@ -59,30 +56,46 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     from scipy.spatial.transform import Rotation
 
     cameras = dict(document.get("cameras").entries("camera"))
-    lenses: dict[str, ForeignLens] = {}  # of the cameras that shots name
-    shots, views, poses = {}, {}, {}
-    for number, (key, shot) in enumerate(document.get("shots").entries("shot")):
+    lenses: dict[str, Lens] = {}  # of the cameras that shots name
+    shots, rotations, translations = {}, [], []
+    for key, shot in document.get("shots").entries("shot"):
         camera = shot.get("camera").text()
         if camera not in cameras:
             shot.fail(f"names camera {display_name(camera)}, which is not there")
         if camera not in lenses:
-            lenses[camera] = _lens(cameras[camera])
-        shots[key], views[number] = number, (number, camera)
-        rotation = Rotation.from_rotvec(shot.get("rotation").vector(3)).as_matrix()
-        poses[number] = checked_pose(shot, rotation, (-rotation.T @ shot.get("translation").vector(3)).tolist())
+            lenses[camera] = lens(cameras[camera])
+        shots[key] = camera
+        rotations.append(Rotation.from_rotvec(shot.get("rotation").vector(3)).as_matrix())
+        if not are_rotations(rotations[-1][None])[0]:
+            shot.fail("has a rotation that is none")
+        translations.append(shot.get("translation").vector(3))
     if not document.has("points"):
         document.fail("has no points, only cameras and shots")
     entries = document.get("points").entries("point")
-    landmarks: dict[str, Landmark] = {key: (point.get("coordinates").vector(3), [], []) for key, point in entries}
-    if not shots or not landmarks:
+    points = {key: point.get("coordinates").vector(3) for key, point in entries}
+    if not shots or not points:
         document.fail(f"has no {'points' if shots else 'shots'}")
-    seen, unused = _read_tracks(_tracks_beside(path), shots, landmarks)
+    seen, unused = _read_tracks(_tracks_beside(path), shots, points)
     note_unused(path, document.unknown(PARTS) | _unused(document, path) | unused)
-    for (image, track), (x, y) in seen.items():
-        width, height = lenses[views[shots[image]][1]].size
-        landmarks[track][1].append(shots[image])
-        landmarks[track][2].append([max(width, height) * x + width / 2, max(width, height) * y + height / 2])
-    return build(path, views, poses, lenses, lenses.__getitem__, landmarks.values())
+    shot_at, point_at = ({key: at for at, key in enumerate(keys)} for keys in (shots, points))
+    kept, camera_index = np.unique([shot_at[image] for image, _ in seen], return_inverse=True)
+    if len(kept) < len(shots):
+        note(path, f"{len(shots) - len(kept)} of {len(shots)} images left out: they see no point")
+    names = [list(shots.values())[at] for at in kept]
+    used = list(dict.fromkeys(names))
+    lens_of = np.array([used.index(name) for name in names])
+    size = np.array([lenses[name].size for name in names])[camera_index]
+    return assemble(
+        path,
+        [lenses[name] for name in used],
+        lens_of,
+        np.array(rotations)[kept],
+        np.array(translations)[kept],
+        np.array(list(points.values())),
+        size.max(axis=1, keepdims=True) * np.array(list(seen.values())) + size / 2,
+        camera_index,
+        np.array([point_at[track] for _, track in seen]),
+    )
 
 
 def _unused(document: Record, path: StrPath) -> dict[str, int]:
@@ -104,35 +117,6 @@ def _refuse_rigs(document: Record) -> None:
         shots = list(instance.get("rig_camera_ids").entries("shot")) if instance.has("rig_camera_ids") else []
         if len(shots) > 1:
             instance.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
-
-
-def _lens(camera: Record) -> ForeignLens:
-    """The lens of a camera, in pixels from the corner of the image."""
-    model = camera.get("projection_type", "perspective").text()
-    if model not in MODELS:
-        camera.fail(f"has projection_type {model!a}, which is not read; read are {', '.join(MODELS)}")
-    width, height = camera.get("width").number(), camera.get("height").number()
-    if not min(width, height) > 0:
-        camera.fail("has no width and height, so that nothing can be in pixels")
-    side = max(width, height)
-    optional = lambda key: camera.get(key, 0.0).number()
-    if model in _RADIAL:
-        focal = camera.get("focal_x").number(), camera.get("focal_y").number()
-        offset = optional("c_x"), optional("c_y")
-        count = _RADIAL[model]
-    else:
-        focal = (camera.get("focal").number(),) * 2
-        offset = (0.0, 0.0)
-        count = 2
-    names = [*(f"k{power}" for power in range(1, count + 1)), *(("p1", "p2") if model == "brown" else ())]
-    return ForeignLens(
-        camera.where,
-        (side * focal[0], side * focal[1]),
-        (width / 2 + side * offset[0], height / 2 + side * offset[1]),
-        {name: optional(name) for name in names},
-        model.startswith("fisheye"),
-        (width, height),
-    )
 
 
 def _tracks_beside(path: StrPath) -> Path:

@@ -9,18 +9,16 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from jaxba.io.decimals import number
 from jaxba.io.encoding import parse_json, read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.problem.bundle_problem import ProblemError
 
-LARGEST_INTEGER = 2**53  # whole numbers below it are exact as float64
 _SHOWN = 40  # characters of a bad value in a message
 
 
 @dataclass(slots=True)
 class Record:
-    """A value of a JSON file, and how messages call it. Numbers may be texts, as AliceVision writes them."""
+    """A value of a JSON file, and how messages call it."""
 
     value: Any
     name: str  # of the file
@@ -29,10 +27,6 @@ class Record:
     def fail(self, complaint: str) -> NoReturn:
         """Raises a `ProblemError` about this value."""
         raise ProblemError(f"{self.name}: {self.where}{' ' if self.where else ''}{complaint}")
-
-    def called(self, where: str) -> Record:
-        """The same value under another name in messages."""
-        return Record(self.value, self.name, where)
 
     def has(self, key: str) -> bool:
         """Whether this is an object with a key whose value is not null."""
@@ -56,8 +50,8 @@ class Record:
         }
 
     def rows(self) -> Iterator[Record]:
-        """The values of a list; an empty text is an empty list, as AliceVision writes one. Raises ProblemError."""
-        if self.value != "" and not isinstance(self.value, list):
+        """The values of a list. Raises ProblemError."""
+        if not isinstance(self.value, list):
             self.fail(f"must be a list, is {_shown(self.value)}")
         for at, value in enumerate(self.value):
             yield Record(value, self.name, f"{self.where}[{at}]")
@@ -69,20 +63,9 @@ class Record:
         for key, value in self.value.items():
             yield key, Record(value, self.name, f"{what} {display_name(key)}")
 
-    def numbered(self, key: str, what: str, inside: str = "") -> Iterator[tuple[int, Record]]:
-        """Rows of a list, or their `inside`, by their numbers at a key, called `what NUMBER`. Raises ProblemError."""
-        for row in self.rows():
-            number = row.get(key).integer()
-            yield number, (row.get(inside) if inside else row).called(f"{what} {number}")
-
     def number(self) -> float:
         """A finite number. Raises ProblemError."""
         value = self.value
-        if isinstance(value, str):
-            try:
-                value = number(value.strip())
-            except ValueError:
-                value = None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             self.fail(f"must be a number, is {_shown(self.value)}")
         try:
@@ -93,28 +76,11 @@ class Record:
             self.fail(f"is not a finite number: {_shown(self.value)}")
         return found
 
-    def integer(self) -> int:
-        """A whole number. Raises ProblemError."""
-        found = self.number()
-        if abs(found) >= LARGEST_INTEGER:
-            self.fail(f"is too large: {_shown(self.value)}")
-        if not found.is_integer():
-            self.fail(f"must be a whole number, is {_shown(self.value)}")
-        return int(found)
-
     def text(self) -> str:
         """A text. Raises ProblemError."""
         if not isinstance(self.value, str):
             self.fail(f"must be a text, is {_shown(self.value)}")
         return self.value
-
-    def flag(self) -> bool:
-        """Truth, also as 0, 1, "true" or "false". Raises ProblemError."""
-        if isinstance(self.value, bool):
-            return self.value
-        if self.value in ("true", "false"):
-            return self.value == "true"
-        return self.number() != 0
 
     def vector(self, size: int) -> list[float]:
         """A list of finite numbers. Raises ProblemError."""
@@ -148,8 +114,5 @@ def read_json(path: StrPath) -> Record:
 def _shown(value: Any) -> str:
     if isinstance(value, (dict, list)):
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
-    try:
-        text = ascii(value)
-    except ValueError:  # an integer of thousands of digits, as a text
-        return "a number of too many digits"
+    text = ascii(value)
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
