@@ -163,10 +163,10 @@ VIEW_FIELDS = ("camera index", "key", "x", "y")
 def read_tracks(
     text: Text, start: int, count: int, num_cameras: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-    """Reads points and their views, as Bundler and VisualSFM write them, from the position of the first one's x among
-    the numbers of a text, whose `field` describes those before the points. Returns positions (count, 3); of each view
-    camera, point and pixel (views, 2); the position after the last number. Raises ProblemError: the file ends early, or
-    something is no number or out of range; or there are no views."""
+    """Reads points and their views, as Bundler writes them, from the position of the first one's x among the numbers of
+    a text, whose `field` describes those before the points. Returns positions (count, 3); of each view camera, point
+    and pixel (views, 2); the position after the last number. Raises ProblemError: the file ends early, or something is
+    no number or out of range; or there are no views."""
     values, before, starts, end = text.values, text.field, [], start
 
     def field(ordinal: int) -> str:

@@ -121,7 +121,7 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
     Such a rejection says nothing about the step, and the next steps, damped more, predict even less. In float64 this is
     far below useful tolerances. In float32 it happens before `ftol` is met."""
     rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
-    known = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not report rejected steps (peers/driven.py)
+    known = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not report rejected steps
     return ~step.accepted & known & _is_negligible(step.predicted, step, rounding)
 
 
