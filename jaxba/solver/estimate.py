@@ -18,7 +18,7 @@ BYTES_PER_OBSERVATION = 1100.0
 Ladybug-1197."""
 
 BYTES_IN_PARTS = 420.0
-"""The same of a process that computes in parts (sharded.py), with the problem. Measured: 370 on a scene of the size of
+"""The same of a process that computes in parts (sharded.py), with the problem. Measured: 386 on a scene of the size of
 Final-13682, `python -m benchmarks.growth --sizes 28988`."""
 
 BYTES_OF_PROGRAM = 0.7e9  # of Python, JAX and the compilation of a step
