@@ -383,7 +383,7 @@ def _checked(args: Arguments) -> tuple[str | None, Survey]:
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")
     outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
-    outputs["--survey"] = args.survey
+    outputs |= {"--survey": args.survey, "--checkpoint": args.checkpoint}
     read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
     check_outputs(args.output, outputs, path, read)
     if args.view:

@@ -40,7 +40,7 @@ def read_bal(path: StrPath) -> BundleProblem:
 def write_bal(problem: BundleProblem, path: StrPath) -> None:
     """Writes a BAL file that reads back bit by bit; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
-    Numbers have the fewest digits that do, with exponents (`6.25e1`), and are written in blocks.
+    Numbers have the fewest digits that do, those of large problems with exponents (`6.25e1`).
 
     The file is replaced whole or not at all. BAL cannot store covariances, weights, shared intrinsics or what is
     constant: these are **not** written, and the problem reads back without whitening and with free intrinsics of its

@@ -59,7 +59,9 @@ class Checkpoint:
         """Raises ValueError: there are several processes."""
         if jax.process_count() > 1:
             raise ValueError("a checkpoint is of one process")
-        settings = policy, replace(options, max_iterations=1, tolerances=Tolerances())
+        options = replace(options, max_iterations=1, tolerances=Tolerances())
+        numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
+        settings = policy, numbers, options
         self._path, self._last = path, time.monotonic()
         self._start, self._tree = jax.tree.flatten(problem)
         found = hashlib.blake2b(repr(settings).encode())

@@ -39,7 +39,7 @@ SECONDS: Work = {
 """Seconds per unit of each kind of work. Fitted to steps with three point iterations in float64 on two cores of an
 x86-64 processor with AVX-512: `python -m benchmarks.choice --fit`."""
 
-ASSUMED_PRODUCTS = 12
+ASSUMED_PRODUCTS = 12.0
 """Assumed conjugate gradient iterations of a step with the two-level preconditioner. Measured: 6 to 20 on real
 problems."""
 
@@ -132,13 +132,18 @@ def work(
     order, width = observations or ObservationOrder.of(problem), _width(problem)
     counts, observed = count_pairs(order), len(order.order)
     every = {"step": 1.0, "observation": observed}
-    solvers = {"implicit": every | {"coarse": observed, "implicit": products * observed}}
+    solvers = {"implicit": implicit_work(observed, products)}
     if _bytes_of_blocks(counts, width) <= MAX_BYTES:
         solvers["sparse"] = every | {"coarse": observed, "block": products * counts.blocks, "pair": counts.pairs}
     factoring, needed = _factoring(order, counts, width, problem.rigs is not None)
     if needed <= MAX_BYTES:
         solvers["explicit"] = every | factoring
     return solvers
+
+
+def implicit_work(observed: int, products: float = ASSUMED_PRODUCTS) -> Work:
+    """Work of one iteration of so many observations with `implicit`."""
+    return {"step": 1.0, "observation": observed, "coarse": observed, "implicit": products * observed}
 
 
 def count_pairs(observations: ObservationOrder) -> PairCounts:

@@ -10,79 +10,74 @@ import numpy as np
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.solver.choose import seconds, work
+from jaxba.solver.choose import implicit_work, seconds, work
 from jaxba.structure.observation_order import ObservationOrder
 
-BYTES_PER_OBSERVATION = 1100.0
-"""Memory of one implicit step in float64: arguments, results and temporaries. Measured: 1,072 on a scene of the size of
+BYTES_PER_OBSERVATION = {"float64": 1100.0, "float32": 605.0}
+"""Memory of one implicit step: arguments, results and temporaries. Measured: 1,072 in float64 on a scene of the size of
 Ladybug-1197."""
 
-BYTES_IN_PARTS = 420.0
-"""The same of a process that computes in parts (sharded.py), with the problem. Measured: 386 on a scene of the size of
-Final-13682, `python -m benchmarks.growth --sizes 28988`."""
+BYTES_IN_PARTS = {"float64": 420.0, "float32": 280.0}
+"""The same of a process that computes in parts (sharded.py), with the problem and what its set-up needs. Measured: 362
+on a scene of the size of Final-13682 in float64, 258 on one of 9.1 million in float32 (`python -m benchmarks.growth`).
+"""
 
 BYTES_OF_PROGRAM = 0.7e9  # of Python, JAX and the compilation of a step
-SINGLE = 0.6  # share in float32 of what is not that
-
 ITERATIONS = 10  # of a solve, assumed
 LONG_S = 10.0  # seconds of a solve that is announced
+ANNOUNCED = 100_000  # observations from which on a solve may be long
 
 
 class Estimate(NamedTuple):
-    """Of one solve."""
+    """What the observations of a problem take."""
 
     observations: int
     """Number of observations."""
 
-    memory: float
-    """Bytes that the observations take on a device in float64, or in this process on a CPU."""
+    memory: dict[str, float]
+    """Bytes on a device, or in this process on a CPU, in float64 and float32."""
 
     available: float
-    """Bytes that it has for them; infinite if that is not known."""
+    """Bytes that there are for them; infinite if that is not known."""
 
-    iteration_s: float
-    """Seconds of an iteration on a machine like that of `choose.SECONDS`."""
-
-    @property
-    def is_long(self) -> bool:
-        """Whether the solve is worth an announcement."""
-        return ITERATIONS * self.iteration_s > LONG_S
-
-    def check(self, *, single: bool) -> None:
-        """Raises a ProblemError with the arithmetic if the memory does not suffice, in float32 if `single`."""
-        needed = self.memory * (SINGLE if single else 1)
-        if needed > self.available:
+    def check(self, dtype: str) -> None:
+        """Raises a ProblemError with the arithmetic if the memory does not suffice in this type of numbers."""
+        if self.memory[dtype] > self.available:
+            double, single = (self.memory[name] / 1e9 for name in ("float64", "float32"))
             raise ProblemError(
-                f"{self.observations} observations take some {self.memory / 1e9:.1f} GB in float64 and "
-                f"{SINGLE * self.memory / 1e9:.1f} in float32, and there are {self.available / 1e9:.1f}: take float32 "
-                "(--dtype) if that fits, more devices or processes, or fewer points"
+                f"{self.observations} observations take some {double:.1f} GB in float64 and {single:.1f} in float32, "
+                f"and there are {self.available / 1e9:.1f}: take float32 (--dtype) if that fits, more devices or "
+                "processes, or fewer points"
             )
 
-    def __str__(self) -> str:
-        return (
-            f"{self.observations} observations: some {self.memory / 1e9:.2g} GB of {self.available / 1e9:.2g}, and "
-            f"{self.iteration_s:.2g} s an iteration"
-        )
+    def told(self, dtype: str, iteration_s: float) -> str:
+        """In words, with the seconds of an iteration."""
+        memory = f"some {self.memory[dtype] / 1e9:.2g} GB of {self.available / 1e9:.2g}"
+        return f"{self.observations} observations: {memory}, and {iteration_s:.2g} s an iteration"
 
 
-def estimate(
-    problem: BundleProblem,
-    options: StepOptions,
-    *,
-    observations: ObservationOrder | None = None,
-    devices: int = 1,
-    in_parts: bool = False,
-) -> Estimate:
-    """Of a solve with these options, divided among devices, each of which computes part by part or not. `observations`
-    are the sorted ones of the problem, if they are known already."""
-    on_gpu, count = device_memory(), len(problem.observations)
-    each = BYTES_IN_PARTS if in_parts else BYTES_PER_OBSERVATION
+def estimate(observations: int, *, devices: int = 1, in_parts: bool = False) -> Estimate:
+    """What so many observations take, divided among devices, each of which computes part by part or not."""
+    on_gpu, each = device_memory(), BYTES_IN_PARTS if in_parts else BYTES_PER_OBSERVATION
+    share = devices if np.isfinite(on_gpu) else jax.process_count()
+    available = on_gpu if np.isfinite(on_gpu) else process.memory() - BYTES_OF_PROGRAM
+    return Estimate(observations, {name: size * observations / share for name, size in each.items()}, available)
+
+
+def iteration_seconds(problem: BundleProblem, options: StepOptions, observations: ObservationOrder) -> float:
+    """Of an iteration with these options on a machine like that of `choose.SECONDS`; zero for few observations, which
+    are not worth the count of their pairs."""
+    if len(observations.order) < ANNOUNCED:
+        return 0.0
+    if options.linear_solver == "implicit":
+        return seconds(implicit_work(len(observations.order)))
     amounts = work(problem, observations=observations)
-    chosen = amounts.get(options.linear_solver, amounts["implicit"])
-    if np.isfinite(on_gpu):
-        return Estimate(count, each * count / devices, on_gpu, seconds(chosen))
-    available = process.memory() - BYTES_OF_PROGRAM
-    return Estimate(count, each * count / jax.process_count(), available, seconds(chosen))
+    return seconds(amounts.get(options.linear_solver, amounts["implicit"]))
+
+
+def is_long(iteration_s: float) -> bool:
+    """Whether a solve is worth an announcement."""
+    return ITERATIONS * iteration_s > LONG_S
 
 
 def device_memory() -> float:

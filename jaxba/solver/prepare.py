@@ -24,7 +24,7 @@ from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.diagnosis import explain_start
-from jaxba.solver.estimate import estimate
+from jaxba.solver.estimate import estimate, is_long, iteration_seconds
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import Placed, check_problem, placed
@@ -170,10 +170,10 @@ def set_up(
             asked = "explicit"  # to the largest capacity it is never slow
         step = choose_linear_solver(here, step, asked, observations)
         parts = num_parts(here, step, len(devices)) if in_parts else 1
-        needs = estimate(here, step, observations=observations, devices=len(devices), in_parts=parts > 1)
-        needs.check(single=dtype == np.float32)
-        if tell and needs.is_long:
-            tell(str(needs))
+        needs = estimate(len(observations.order), devices=len(devices), in_parts=parts > 1)
+        needs.check(dtype.name)
+        if tell and is_long(iteration_s := iteration_seconds(here, step, observations)):
+            tell(needs.told(dtype.name, iteration_s))
         shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
         if parts > 1:
             process.return_memory()

@@ -106,7 +106,8 @@ class Shards:
         self.first = layouts[0]
         orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
         columns = list(zip(*map(jax.tree.leaves, layouts), strict=True))
-        differ = [{k for k, one in enumerate(columns) if not all(np.array_equal(one[0], x) for x in one[1:])}]
+        alike = lambda one: self.in_parts and all(np.array_equal(one[0], x) for x in one[1:])
+        differ = [{k for k, one in enumerate(columns) if not alike(one)}]
         differ = set().union(*distributed.gather(differ))
         apart = tuple(k in differ for k in range(len(columns)))
         self.static = {"mesh": self._mesh, "options": options, "differ": apart}
@@ -146,12 +147,11 @@ class Shards:
         given = self.layout, carry, policy, tolerances, limit
         if length:
             return _run(*given, **self.static, length=length)
-        once = self._once = self._once or self._compiled(given)
-        return once(*given)
+        return (self._once or self.compiled(*given[1:]))(*given)
 
-    def _compiled(self, given: tuple[Any, ...]) -> Callable[..., tuple[Carry, StepInfo]]:
-        """The program of one iteration."""
-        found = _run.lower(*given, **self.static, length=0).compile()
+    def compiled(self, *given: Any) -> Callable[..., tuple[Carry, StepInfo]]:
+        """The program of one iteration, compiled for the arguments of `run`."""
+        self._once = found = _run.lower(self.layout, *given, **self.static, length=0).compile()
         process.return_memory()  # of the compiler
         return found
 
@@ -240,8 +240,9 @@ def num_parts(problem: BundleProblem, options: StepOptions, devices: int) -> int
     form the reduced camera system need nothing of all parts at once."""
     if options.linear_solver != "implicit" or options.method or jax.default_backend() != "cpu":
         return 1
-    part = max(PART, PART_OF_CAMERA * problem.num_cameras)
-    return problem.num_observations // (part * devices) if problem.num_observations >= LARGE * devices else 1
+    if problem.num_observations < LARGE * devices:
+        return 1
+    return max(1, problem.num_observations // (devices * max(PART, PART_OF_CAMERA * problem.num_cameras)))
 
 
 def deal_points(

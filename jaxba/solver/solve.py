@@ -238,10 +238,10 @@ def solve_without(
         initial_cost, before_s = (saved.initial_cost, saved.total_s) if saved else (initial_cost, 0.0)
         elapsed = lambda: before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
         steps, records = None, saved.steps if saved else []
-        if saved:
+        end = Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
+        if saved and end == Termination.RUNNING:
             driver.carry = saved.continued(driver.carry)
             waiting.tell(f"goes on after {len(records)} iterations")
-        end = Termination.RUNNING if options.max_iterations else Termination.MAX_ITERATIONS
         if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
             steps, end = driver.finish()
         while end == Termination.RUNNING and not isinstance(driver, Compiled):

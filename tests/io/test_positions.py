@@ -107,21 +107,29 @@ def test_columns_of_accuracy_are_standard_deviations(columns, cells, variances, 
     assert crs == ""
 
 
+FRAME = '{"frames": [{"transform_matrix": %s}]}'
+
+
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("name", "text", "message"),
     [
-        ("a.jpg,1,2,3\n", "log.csv: no line names the columns"),
-        ("image,lat,lon\na.jpg,1,2\n", "log.csv line 1: there is no column height"),
-        ("image,lat,lon,alt\n\na.jpg,1,x,3\n", "log.csv line 3: 'x' is not a number (longitude)"),
-        ("image,lat,lon,alt\na.jpg,1,2\n", "log.csv line 2: has 3 columns, fewer than the line of names"),
-        ("image,lat,lon,alt,accuracy\na.jpg,1,2,3,0\n", "log.csv line 2: an accuracy is not positive"),
-        ("image,lat,lon,alt\n", "log.csv: has no positions"),
+        ("log.csv", "a.jpg,1,2,3\n", ": no line names the columns"),
+        ("log.csv", "image,lat,lon\na.jpg,1,2\n", " line 1: there is no column height"),
+        ("log.csv", "image,lat,lon,alt\n\na.jpg,1,x,3\n", " line 3: 'x' is not a number (longitude)"),
+        ("log.csv", "image,lat,lon,alt\na.jpg,1,2\n", " line 2: has 3 columns, fewer than the line of names"),
+        ("log.csv", "image,lat,lon,alt,accuracy\na.jpg,1,2,3,0\n", " line 2: an accuracy is not positive"),
+        ("log.csv", "image,lat,lon,alt\n", ": has no positions"),
+        ("transforms.json", '{"frames": []}', ": has no frames"),
+        ("transforms.json", '{"frames": [{"file_path": "a"}]}', ": frames[0] has no transform_matrix"),
+        ("transforms.json", FRAME % "[[1, 2, 3, 4]]", "transform_matrix must have three or four rows"),
+        ("transforms.json", FRAME % "[[1, 2], [3, 4], [5, 6]]", "transform_matrix[0] must be a list of 4"),
     ],
 )
-def test_a_bad_table_is_one_line_with_file_and_line(text, message, tmp_path):
-    (tmp_path / "log.csv").write_text(text)
+def test_a_bad_file_is_one_line_with_its_name_and_place(name, text, message, tmp_path):
+    (tmp_path / name).write_text(text)
     with pytest.raises(ProblemError) as caught:
-        read_table(tmp_path / "log.csv")
+        (read_table if name == "log.csv" else read_transforms)(tmp_path / name)
+    assert name in str(caught.value)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -211,19 +219,3 @@ def test_positions_of_nerfstudio_are_in_the_world_before_its_transform(tmp_path)
     assert names == ["a.jpg", "left/b.jpg", "c.jpg"]
     np.testing.assert_array_equal(places, PLACES)
     assert (covariances, crs) == (None, "")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"frames": []}', "transforms.json: has no frames"),
-        ('{"frames": [{"file_path": "a"}]}', "transforms.json: frames[0] has no transform_matrix"),
-        ('{"frames": [{"transform_matrix": [[1, 2, 3, 4]]}]}', "transform_matrix must have three or four rows"),
-        ('{"frames": [{"transform_matrix": [[1, 2], [3, 4], [5, 6]]}]}', "transform_matrix[0] must be a list of 4"),
-    ],
-)
-def test_bad_frames_of_nerfstudio_are_one_line(text, message, tmp_path):
-    (tmp_path / "transforms.json").write_text(text)
-    with pytest.raises(ProblemError) as caught:
-        read_transforms(tmp_path / "transforms.json")
-    assert message in str(caught.value)

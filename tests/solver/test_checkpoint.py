@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import support
@@ -67,6 +69,24 @@ def test_numbers_of_residuals_are_in_it_and_more_iterations_may_follow(tmp_path)
 @jaxba.residual
 def scaled(size, pose, *, measured):
     return size[0] * pose.center[0] - measured
+
+
+def test_a_reached_limit_is_not_solved_again_and_networks_differ_by_their_weights(tmp_path):
+    problem, file = support.tiny(), tmp_path / "solve.npz"
+    five = replace(OPTIONS, max_iterations=5)
+    done, again = (solve(problem, "ceres", five, checkpoint=file) for _ in range(2))
+    assert again.iterations == done.iterations == 5
+    assert again.termination == done.termination == jaxba.Termination.MAX_ITERATIONS
+    assert again.final_cost == pytest.approx(done.final_cost, rel=1e-9)
+    none = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=0), checkpoint=file)
+    assert none.final_cost == pytest.approx(done.final_cost, rel=1e-9)
+    learned = jaxba.make_policy("learned")
+    first, *others = learned.layers
+    other = replace(learned, layers=(first._replace(bias=first.bias + 1), *others))
+    options = SolveOptions(max_iterations=1)
+    solve(problem, learned, options, checkpoint=tmp_path / "learned.npz")
+    with pytest.raises(ProblemError, match="the checkpoint of another problem, policy or options"):
+        solve(problem, other, options, checkpoint=tmp_path / "learned.npz")
 
 
 def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):

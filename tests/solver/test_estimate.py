@@ -10,35 +10,44 @@ import jaxba
 from jaxba import ProblemError, SolveOptions, StepOptions
 from jaxba.runtime import process
 from jaxba.solver import estimate as module
-from jaxba.solver.estimate import BYTES_IN_PARTS, BYTES_OF_PROGRAM, BYTES_PER_OBSERVATION, SINGLE, estimate
-
-IMPLICIT = StepOptions(linear_solver="implicit")
+from jaxba.solver.estimate import (
+    BYTES_IN_PARTS,
+    BYTES_OF_PROGRAM,
+    BYTES_PER_OBSERVATION,
+    estimate,
+    is_long,
+    iteration_seconds,
+)
+from jaxba.structure.observation_order import ObservationOrder
 
 
 def test_observations_that_a_device_cannot_hold_are_refused_with_the_arithmetic(monkeypatch):
     problem = support.tiny()
-    needed = BYTES_PER_OBSERVATION * problem.num_observations
+    needed = {name: size * problem.num_observations for name, size in BYTES_PER_OBSERVATION.items()}
     message = r"observations take some .* GB in float64 and .* in float32, and there are .*: take float32"
     for patched, where, more in ((module, "device_memory", 0), (process, "memory", BYTES_OF_PROGRAM)):
-        with monkeypatch.context() as patch:
-            patch.setattr(patched, where, lambda more=more: needed + more - 1)
-            with pytest.raises(ProblemError, match=message):
-                jaxba.solve(problem, options=SolveOptions(max_iterations=0))
-            estimate(problem, IMPLICIT).check(single=True)
-            patch.setattr(patched, where, lambda more=more: SINGLE * needed + more - 1)
-            with pytest.raises(ProblemError, match=message):
-                estimate(problem, IMPLICIT).check(single=True)
-    monkeypatch.setattr(module, "device_memory", lambda: needed - 1)
-    estimate(problem, IMPLICIT, devices=2).check(single=False)
+        for dtype, size in needed.items():
+            with monkeypatch.context() as patch:
+                patch.setattr(patched, where, lambda size=size, more=more: size + more - 1)
+                with pytest.raises(ProblemError, match=message):
+                    jaxba.solve(problem, options=SolveOptions(max_iterations=0, dtype=dtype))
+                estimate(problem.num_observations - 1).check(dtype)
+    monkeypatch.setattr(module, "device_memory", lambda: needed["float64"] - 1)
+    estimate(problem.num_observations, devices=2).check("float64")
 
 
-def test_parts_and_larger_problems_count():
-    small, large = (estimate(random_views(20, points, 0), IMPLICIT) for points in (60, 600))
-    assert large.memory > 5 * small.memory
-    assert large.iteration_s > small.iteration_s
-    in_parts = estimate(random_views(20, 60, 0), IMPLICIT, in_parts=True)
-    assert in_parts.memory == pytest.approx(small.memory * BYTES_IN_PARTS / BYTES_PER_OBSERVATION)
-    assert not large.is_long
+def test_parts_take_less_and_larger_problems_take_longer(monkeypatch):
+    in_parts, whole = estimate(1000, in_parts=True), estimate(1000)
+    assert in_parts.memory == {name: 1000 * size for name, size in BYTES_IN_PARTS.items()}
+    assert all(in_parts.memory[name] < whole.memory[name] for name in whole.memory)
+    orders = [ObservationOrder.of(problem) for problem in (random_views(20, 60, 0), random_views(20, 600, 0))]
+    problem = random_views(20, 600, 0)
+    assert iteration_seconds(problem, StepOptions(), orders[1]) == 0  # too few to count their pairs
+    monkeypatch.setattr(module, "ANNOUNCED", 0)
+    for solver in ("explicit", "sparse", "implicit"):
+        small, large = (iteration_seconds(problem, StepOptions(linear_solver=solver), order) for order in orders)
+        assert 0 < small < large
+        assert not is_long(large)
 
 
 def test_memory_of_the_machine_is_known():

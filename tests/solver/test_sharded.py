@@ -155,6 +155,17 @@ def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(
     np.testing.assert_allclose(geometry.cost(in_parts.problem), geometry.cost(whole.problem), rtol=1e-9)
 
 
+def test_a_large_problem_of_many_cameras_has_a_part_at_least(monkeypatch):
+    problem, options = sequence(), StepOptions(linear_solver="implicit")
+    monkeypatch.setattr(sharded, "LARGE", 1)
+    monkeypatch.setattr(sharded, "PART_OF_CAMERA", problem.num_observations)
+    assert sharded.num_parts(problem, options, 1) == sharded.num_parts(problem, options, 2) == 1
+    monkeypatch.setattr(sharded, "PART_OF_CAMERA", 0)
+    monkeypatch.setattr(sharded, "PART", problem.num_observations // 7)
+    assert sharded.num_parts(problem, options, 1) >= 7
+    assert sharded.num_parts(problem, StepOptions(linear_solver="explicit"), 1) == 1
+
+
 @pytest.mark.slow
 def test_a_callback_sees_the_same_iterations_and_stops():
     problem, records = sequence(), []
