@@ -21,6 +21,9 @@ class Waiting:
     def tell(self, text: str) -> None:
         """Before a long solve: what it takes."""
 
+    def resume(self, iterations: int, time_s: float) -> None:
+        """Before a solve goes on after so many iterations and seconds."""
+
     def compiling(self) -> AbstractContextManager:
         """The context in which programs compile."""
         return nullcontext()
@@ -39,10 +42,16 @@ class Printed(Waiting):
 
     def __init__(self) -> None:
         self._last_s = 0.0
+        self.time_s = 0.0  # of the iterations so far
 
     def tell(self, text: str) -> None:
         """See `Waiting`."""
         print(text, flush=True)
+
+    def resume(self, iterations: int, time_s: float) -> None:
+        """See `Waiting`."""
+        self.tell(f"goes on after {iterations} iterations")
+        self.time_s = time_s
 
     def compiling(self) -> AbstractContextManager:
         """See `Waiting`."""
@@ -68,17 +77,17 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Wa
     """A callback that prints a row and calls the one that is given, and what is printed of things that take time."""
     if not verbose:
         return callback, SILENT
-    time_before = None
+    printed, begun = Printed(), False
 
     def show(record: IterationRecord) -> bool | None:
-        nonlocal time_before
-        if time_before is None:
-            print(f"{COLUMNS}\n{0:4d}  {record.step.previous_cost:.6e}", flush=True)
-        print(row(record, time_before or 0.0), flush=True)
-        time_before = record.time_s
+        nonlocal begun
+        if not begun:
+            print(f"{COLUMNS}\n{record.iteration - 1:4d}  {record.step.previous_cost:.6e}", flush=True)
+        print(row(record, printed.time_s), flush=True)
+        begun, printed.time_s = True, record.time_s
         return callback and callback(record)
 
-    return show, Printed()
+    return show, printed
 
 
 def row(record: IterationRecord, time_before: float) -> str:

@@ -241,7 +241,7 @@ def solve_without(
         end = Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
         if saved and end == Termination.RUNNING:
             driver.carry = saved.continued(driver.carry)
-            waiting.tell(f"goes on after {len(records)} iterations")
+            waiting.resume(len(records), before_s)
         if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
             steps, end = driver.finish()
         while end == Termination.RUNNING and not isinstance(driver, Compiled):
