@@ -2,11 +2,13 @@
 
     python -m benchmarks.growth [--sizes 30,100,300,1000,3000,9125,28988] [--devices 1] [--figure FILE.png]
     python -m benchmarks.growth --sizes 28988 --policy guarded --iterations 100
+    python -m benchmarks.growth --sizes 1000,3000,5000 --policy guarded --iterations 100 --ceres 5000
 
 Random scenes with the proportions of BAL's Final-13682: 2,119 observations an image, 6.5 a point; the largest has its
 counts. Each is a process of its own, solved with the implicit solver, by default by the rule `ceres` for a few
-iterations; memory is its largest resident set. With `JAXBA_CERES` Ceres' iterative mode solves the smaller ones, too.
-Sizes are in thousands of observations.
+iterations; memory is its largest resident set. With `JAXBA_CERES` Ceres' iterative mode solves those up to `--ceres`,
+too, with as many iterations. `to_end_s` and `ceres_to_end_s` are seconds until the cost is within 1e-3 of the lower of
+both ends, without set-up and compilation. Sizes are in thousands of observations.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from benchmarks import peers
 IMAGES, POINTS, OBSERVATIONS = 13_682, 4_456_117, 28_987_644  # Final-13682
 
 ITERATIONS = 5
-LARGEST_FOR_CERES = 1_000_000
+CERES_LIMIT_S = 3600
+WITHIN = 1e-3  # of the lower end
 
 
 def scene(observations: int) -> Any:
@@ -57,8 +60,14 @@ def measure(observations: int, args: argparse.Namespace) -> dict[str, Any]:
     )
     if devices > 1:
         jax.config.update("jax_num_cpu_devices", devices)
+    costs, times = [], []
+
+    def note(record: jaxba.IterationRecord) -> None:
+        costs.append(record.step.cost)
+        times.append(record.time_s)
+
     started = time.perf_counter()
-    found = jaxba.solve(problem, args.policy, options)
+    found = jaxba.solve(problem, args.policy, options, callback=None if args.iterations == ITERATIONS else note)
     return {
         "observations": problem.num_observations,
         "images": problem.num_cameras,
@@ -74,11 +83,13 @@ def measure(observations: int, args: argparse.Namespace) -> dict[str, Any]:
         "final_cost": found.final_cost,
         "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
         "problem_gb": base,
+        "costs": costs,
+        "times": times,
     }
 
 
-def ceres(observations: int) -> float | None:
-    """Seconds of an iteration of Ceres' iterative mode; None without the program."""
+def ceres(observations: int, iterations: int) -> peers.CeresRun | None:
+    """A solve by Ceres' iterative mode; None without the program."""
     from jaxba.io import write_problem
 
     binary = peers.program()
@@ -87,7 +98,7 @@ def ceres(observations: int) -> float | None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "problem.txt"
         write_problem(scene(observations), file)
-        return peers.run(binary, file, "ITERATIVE_SCHUR", 2, ITERATIONS).seconds_per_iteration
+        return peers.run(binary, file, "ITERATIVE_SCHUR", 2, iterations, CERES_LIMIT_S)
 
 
 def main() -> None:
@@ -98,6 +109,7 @@ def main() -> None:
     parser.add_argument("--policy", default="ceres")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--dtype", default="float64")
+    parser.add_argument("--ceres", type=float, default=1000, help="largest size that Ceres solves, too")
     parser.add_argument("--figure")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -110,7 +122,14 @@ def main() -> None:
     for size in (min(OBSERVATIONS, round(1000 * float(size))) for size in args.sizes.split(",")):
         command = [sys.executable, "-m", "benchmarks.growth", "--one", str(size), *passed]
         row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
-        row["ceres_s"] = ceres(size) if size <= LARGEST_FOR_CERES else None
+        peer = ceres(size, args.iterations) if size <= 1000 * args.ceres else None
+        costs, times = row.pop("costs"), row.pop("times")
+        row["ceres_s"] = peer and peer.seconds_per_iteration
+        if peer and costs:
+            goal = (1 + WITHIN) * min(*costs, *peer.costs)
+            row["to_end_s"] = next((t for t, cost in zip(times, costs, strict=True) if cost <= goal), None)
+            row |= {"ceres_to_end_s": peer.seconds_to(goal), "ceres_final_cost": peer.final_cost}
+            row |= {"ceres_all_s": peer.total_s, "ceres_iterations": peer.iterations}
         rows.append(row)
         print(json.dumps(row), flush=True)
     if args.figure:

@@ -12,7 +12,7 @@ import pickle
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -29,6 +29,7 @@ PATIENCE_S = 5  # seconds after which a process says that it waits for others at
 HEARTBEAT_S = 30  # seconds of silence after which a process counts as dead and JAX ends the others; its default is 100
 WAIT_MS = 1 << 30  # twelve days, for which processes wait for the first one; Gloo's collectives wait half an hour
 THREADS = 8  # of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill
+BLOCK = 1 << 24  # bytes that are sent to other processes at once
 LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")  # in errors where a process is gone
 
 _done = itertools.count()
@@ -157,27 +158,45 @@ def together(work: Callable[[], T]) -> T:
     name = f"jaxba/{next(_done)}"
     if not is_main():
         client.blocking_key_value_get(name, WAIT_MS)
-        found = _broadcast(b"")
+        found, buffers = _broadcast(b"", [])
         if not found:
             raise MainFailedError
-        return pickle.loads(found)
-    content = b""
+        return pickle.loads(found, buffers=buffers)
+    content, buffers = b"", []
     try:
         result = work()
-        content = pickle.dumps(result)
+        arrays: list[pickle.PickleBuffer] = []  # of NumPy, which are sent as they are
+        content = pickle.dumps(result, protocol=5, buffer_callback=arrays.append)
+        buffers = [one.raw() for one in arrays]
     finally:
         client.key_value_set(name, "done")
-        _broadcast(content)
+        _broadcast(content, buffers)
     return result
 
 
-def _broadcast(content: bytes) -> bytes:
-    """The content that the first process has, in all of them."""
-    size = int(multihost_utils.broadcast_one_to_all(np.asarray(len(content), np.int32)))
-    padded = np.zeros(size, np.uint8)
-    if is_main():
-        padded[:] = np.frombuffer(content, np.uint8)
-    return np.asarray(multihost_utils.broadcast_one_to_all(padded)).tobytes() if size else b""
+def _broadcast(content: bytes, buffers: Sequence[Any]) -> tuple[bytes, Sequence[Any]]:
+    """The content and the buffers that the first process has, in all of them."""
+    send = multihost_utils.broadcast_one_to_all
+    each = [content, pickle.dumps([len(one) for one in buffers])]
+    counts = np.asarray(send(np.asarray([len(one) for one in each], np.int32)))
+    each = each if is_main() else [bytearray(int(count)) for count in counts]
+    _send(each)
+    sizes = pickle.loads(each[1])
+    buffers = buffers if is_main() else [bytearray(size) for size in sizes]
+    _send(buffers)
+    return bytes(each[0]), buffers
+
+
+def _send(buffers: Sequence[Any]) -> None:
+    """Fills the buffers of all other processes with those of the first one, block by block: JAX copies what it sends
+    several times."""
+    for buffer in buffers:
+        whole = np.frombuffer(buffer, np.uint8)
+        for start in range(0, len(whole), BLOCK):
+            block = whole[start : start + BLOCK]
+            found = multihost_utils.broadcast_one_to_all(block)
+            if not is_main():
+                block[:] = np.asarray(found)
 
 
 def gather(values: list[T]) -> list[T]:

@@ -292,14 +292,15 @@ def sharded_layout(
     in all processes for what was found here."""
     known: dict[str, Any] = {}
     common: dict[str, Any] = {}
-    for number in range(MAX_ROUNDS):
-        common = {} if number < 2 else common  # the first round knows no totals
-        agreements = [Agreement(known, common) for _ in shards]
-        build = lambda shard, one: build_layout(shard, options, agreement=one)
-        with ThreadPoolExecutor(process.threads()) as threads:
+    with ThreadPoolExecutor(process.threads()) as threads:
+        for number in range(MAX_ROUNDS):
+            common = {} if number < 2 else common  # the first round knows no totals
+            agreements = [Agreement(known, common) for _ in shards]
+            build = lambda shard, one: build_layout(shard, options, agreement=one)
             layouts = list(threads.map(build, shards, agreements))
-        found = merged(merge([one.found for one in agreements]), known)
-        if same(found, known):
-            return [replace(layout, axes=(DEVICES,)) for layout in layouts]
-        known = found
+            found = merged(merge([merged([one.found for one in agreements], {})]), known)
+            if same(found, known):
+                return [replace(layout, axes=(DEVICES,)) for layout in layouts]
+            del layouts  # before there are others
+            known = found
     raise RuntimeError("the layouts of shards do not agree")
