@@ -113,7 +113,7 @@ class OnDevices(Driver):
         """The state at the start."""
         self.carry = self._shards.begin(self.setup.policy, self.limit)
         if not self.whole:
-            self._shards.compiled(self.carry, self.setup.policy, self.tolerances, self.limit)
+            self._shards.compile(self.carry, self.setup.policy, self.tolerances, self.limit)
         return jax.block_until_ready(self.carry.state)
 
     def finish(self) -> tuple[StepInfo, Termination]:

@@ -22,6 +22,11 @@ BYTES_IN_PARTS = {"float64": 420.0, "float32": 280.0}
 on a scene of the size of Final-13682 in float64, 258 on one of 9.1 million in float32 (`python -m benchmarks.growth`).
 """
 
+SECONDS_IN_PARTS = 2.0
+"""Seconds of an iteration in parts, relative to those of `choose.SECONDS`, which were fitted to smaller problems.
+Measured from 1 to 29 million observations: 1.5 to 2.1 with rule `ceres`, 2.5 to 4.2 with `guarded` until convergence
+(`python -m benchmarks.growth`)."""
+
 BYTES_OF_PROGRAM = 0.7e9  # of Python, JAX and the compilation of a step
 ITERATIONS = 10  # of a solve, assumed
 LONG_S = 10.0  # seconds of a solve that is announced
@@ -64,13 +69,15 @@ def estimate(observations: int, *, devices: int = 1, in_parts: bool = False) -> 
     return Estimate(observations, {name: size * observations / share for name, size in each.items()}, available)
 
 
-def iteration_seconds(problem: BundleProblem, options: StepOptions, observations: ObservationOrder) -> float:
-    """Of an iteration with these options on a machine like that of `choose.SECONDS`; zero for few observations, which
-    are not worth the count of their pairs."""
+def iteration_seconds(
+    problem: BundleProblem, options: StepOptions, observations: ObservationOrder, *, in_parts: bool = False
+) -> float:
+    """Of an iteration with these options, in parts or not, on a machine like that of `choose.SECONDS`; zero for few
+    observations, which are not worth the count of their pairs."""
     if len(observations.order) < ANNOUNCED:
         return 0.0
     if options.linear_solver == "implicit":
-        return seconds(implicit_work(len(observations.order)))
+        return (SECONDS_IN_PARTS if in_parts else 1.0) * seconds(implicit_work(len(observations.order)))
     amounts = work(problem, observations=observations)
     return seconds(amounts.get(options.linear_solver, amounts["implicit"]))
 

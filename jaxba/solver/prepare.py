@@ -172,7 +172,7 @@ def set_up(
         parts = num_parts(here, step, len(devices)) if in_parts else 1
         needs = estimate(len(observations.order), devices=len(devices), in_parts=parts > 1)
         needs.check(dtype.name)
-        if tell and is_long(iteration_s := iteration_seconds(here, step, observations)):
+        if tell and is_long(iteration_s := iteration_seconds(here, step, observations, in_parts=parts > 1)):
             tell(needs.told(dtype.name, iteration_s))
         shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
         if parts > 1:

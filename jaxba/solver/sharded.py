@@ -31,6 +31,7 @@ from jaxba.model.linearize import cost
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed, process
+from jaxba.runtime.compilation import ParallelCompilation, compile_and_run, program
 from jaxba.runtime.jit import jit
 from jaxba.runtime.parts import in_turns
 from jaxba.solver.iteration import Carry, begin, iterate, problem_info
@@ -93,7 +94,7 @@ class Shards:
         the method of the options works on one device only, or there are too few points."""
         check_plain(options, ProblemError, devices=True)
         self._devices, self._parts = devices, parts
-        self._once: Callable[..., tuple[Carry, StepInfo]] | None = None  # the program of one iteration
+        self._programs = ParallelCompilation()
         self._mesh = Mesh(np.array(devices), (DEVICES,))
         dealt = deal_points(problem, parts * len(devices), [rows.points for rows in problem.residuals.rows])
         if not len(dealt[-1]):
@@ -110,7 +111,8 @@ class Shards:
         differ = [{k for k, one in enumerate(columns) if not alike(one)}]
         differ = set().union(*distributed.gather(differ))
         apart = tuple(k in differ for k in range(len(columns)))
-        self.static = {"mesh": self._mesh, "options": options, "differ": apart}
+        self._once = program(_run.__wrapped__, "mesh", "options", "differ", "length")  # the program of one iteration
+        self.static = {"mesh": self._mesh if len(devices) > 1 else None, "options": options, "differ": apart}
         placed = [self._placed(list(one), differs) for one, differs in zip(columns, apart, strict=True)]
         self.layout = jax.tree.unflatten(jax.tree.structure(layouts[0]), placed)
         self.order = distributed.to_host(self._placed(orders)).reshape(-1)
@@ -137,8 +139,8 @@ class Shards:
 
     def begin(self, policy: DampingPolicy, limit: Int[np.ndarray, ""]) -> Carry:
         """The carry before the first iteration."""
-        given = self.layout, self._cameras, self._points, policy, limit
-        return _begin(*given, **self.static)
+        given = self.layout, self._cameras, self._points, policy, limit, *self.static.values()
+        return compile_and_run(program(_begin, *self.static), *given)
 
     def run(
         self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int = 0
@@ -147,13 +149,13 @@ class Shards:
         given = self.layout, carry, policy, tolerances, limit
         if length:
             return _run(*given, **self.static, length=length)
-        return (self._once or self.compiled(*given[1:]))(*given)
+        return self._programs.run(self._once, *given, *self.static.values(), 0)
 
-    def compiled(self, *given: Any) -> Callable[..., tuple[Carry, StepInfo]]:
-        """The program of one iteration, compiled for the arguments of `run`."""
-        self._once = found = _run.lower(self.layout, *given, **self.static, length=0).compile()
+    def compile(self, *given: Any) -> None:
+        """Compiles the program of one iteration, for the arguments of `run`."""
+        with self._programs as compile_program:
+            compile_program(self._once, self.layout, *given, *self.static.values(), 0)
         process.return_memory()  # of the compiler
-        return found
 
 
 def _is_here(device: jax.Device) -> bool:
@@ -183,15 +185,13 @@ def _divided(carry: Carry, points: Callable[[Array], Array]) -> Carry:
     return carry._replace(state=carry.state._replace(points=points(carry.state.points)))
 
 
-@functools.partial(jit, static_argnames=("mesh", "options", "differ"))
 def _begin(
     layout: Layout,
     cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "devices *parts 3 points"],
     policy: DampingPolicy,
     limit: Int[Array, ""],
-    *,
-    mesh: Mesh,
+    mesh: Mesh | None,
     options: StepOptions,
     differ: tuple[bool, ...],
 ) -> Carry:
@@ -204,8 +204,7 @@ def _begin(
         return _divided(carry, lambda x: x[None])
 
     places = _DIVIDED, _EVERYWHERE, _DIVIDED, _EVERYWHERE, _EVERYWHERE
-    on_all = jax.shard_map(start, mesh=mesh, in_specs=places, out_specs=_CARRY, check_vma=False)
-    return on_all(layout, cameras, points, policy, limit)
+    return _on_all(start, mesh, places, _CARRY)(layout, cameras, points, policy, limit)
 
 
 @functools.partial(jit, static_argnames=("mesh", "options", "differ", "length"))
@@ -215,8 +214,7 @@ def _run(
     policy: DampingPolicy,
     tolerances: Tolerances,
     limit: Int[Array, ""],
-    *,
-    mesh: Mesh,
+    mesh: Mesh | None,
     options: StepOptions,
     differ: tuple[bool, ...],
     length: int,
@@ -231,8 +229,15 @@ def _run(
         return _divided(carry, lambda x: x[None]), found
 
     places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
-    on_all = jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
-    return on_all(layout, carry, policy, tolerances, limit)
+    return _on_all(on_one, mesh, places, (_CARRY, _EVERYWHERE))(layout, carry, policy, tolerances, limit)
+
+
+def _on_all(function: Callable[..., Any], mesh: Mesh | None, given: Any, found: Any) -> Callable[..., Any]:
+    """The function on every device of the mesh, or on the only one. `given` and `found` say where arguments and results
+    are."""
+    if mesh is None:
+        return function
+    return jax.shard_map(function, mesh=mesh, in_specs=given, out_specs=found, check_vma=False)
 
 
 def num_parts(problem: BundleProblem, options: StepOptions, devices: int) -> int:

@@ -47,7 +47,7 @@ def test_a_step_in_parts_and_the_problem_keep_to_the_stated_bytes_per_observatio
         monkeypatch.setattr(sharded, name, value)
     setup = set_up(problem, "guarded", SolveOptions(linear_solver="implicit", dtype=dtype), in_parts=True)
     limit = np.asarray(5, np.int32)
-    carry = jax.eval_shape(lambda: setup.shards.begin(setup.policy, limit))
+    carry = setup.shards.begin(setup.policy, limit)
     given = setup.shards.layout, carry, setup.policy, Tolerances(), limit
     memory = sharded._run.lower(*given, **setup.shards.static, length=0).compile().memory_analysis()
     assert memory is not None

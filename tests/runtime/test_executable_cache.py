@@ -32,7 +32,7 @@ from jaxba.problem.options import Refinement, StepOptions
 from jaxba.results.retriangulate import retriangulate
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import ParallelCompilation, compile_and_run, program
-from jaxba.solver import stepwise
+from jaxba.solver import sharded, stepwise
 
 pytestmark = [
     pytest.mark.xla,
@@ -121,6 +121,21 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
     )
     assert not set(seen.names) & set(parts)
     assert len(kept(folder)) == count
+    assert support.same_bits(first.history, again.history)
+    assert support.same_bits(first.problem, again.problem)
+
+
+@pytest.mark.slow
+def test_a_second_solve_in_parts_reads_its_programs_and_repeats_itself_bit_by_bit(folder, monkeypatch):
+    problem = support.tiny()
+    for name, value in (("LARGE", 1), ("PART", problem.num_observations // 3), ("PART_OF_CAMERA", 0)):
+        monkeypatch.setattr(sharded, name, value)
+    first = solve(problem, "ceres", linear_solver="implicit", max_iterations=3)
+    assert [path.name.partition("-")[0] for path in kept(folder)] == ["_begin", "_run"]
+    forget()
+    with Compilations() as seen:
+        again = solve(problem, "ceres", linear_solver="implicit", max_iterations=3)
+    assert not {"_begin", "_run"} & set(seen.names)
     assert support.same_bits(first.history, again.history)
     assert support.same_bits(first.problem, again.problem)
 
