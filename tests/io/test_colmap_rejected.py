@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import support
 
-from jaxba import read_colmap, write_colmap
+from jaxba import ProblemWarning, read_colmap, write_colmap
+from jaxba.io.colmap.files import read_model, write_model
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 pytestmark = pytest.mark.extra
@@ -44,6 +47,27 @@ def test_rejected_observations_leave_tracks_and_key_points_and_points_of_one_vie
         np.testing.assert_allclose(point.error, np.mean(errors), rtol=1e-6)
     again = read_colmap(tmp_path / "new")
     assert again.num_observations == int((kept & (views > 1)[problem.point_index]).sum())
+
+
+@pytest.mark.parametrize("key", [None, 0], ids=["no tracks", "tracks of the first key-points"])
+def test_no_more_than_what_was_rejected_is_lost_where_tracks_are_wrong(tmp_path, key):
+    write_colmap(support.tiny(), tmp_path / "old")
+    model = read_model(tmp_path / "old")
+    if key is None:
+        model.points["length"] = 0
+        model = replace(model, tracks=model.tracks[:0])
+    else:
+        model.tracks["key"] = key
+    write_model(model, tmp_path / "old", ".bin")
+    with pytest.warns(ProblemWarning, match="with another track than key-points say"):
+        problem = read_colmap(tmp_path / "old")
+    first = np.unique(problem.camera_index, return_index=True)[1]  # key-point of each image
+    gone = np.isin(np.arange(problem.num_observations), first[:3])  # of six views of a point
+    write_colmap(problem, tmp_path / "new", like=tmp_path / "old", rejected=gone)
+    with pytest.warns(ProblemWarning, match="with another track than key-points say"):
+        again = read_colmap(tmp_path / "new")
+    assert again.num_points == problem.num_points
+    assert np.array_equal(again.observations, problem.observations[~gone])
 
 
 def test_what_does_not_fit_the_model_is_refused(tmp_path):

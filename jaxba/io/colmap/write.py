@@ -113,8 +113,8 @@ def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observ
     point = np.repeat(np.arange(len(heads)), heads["length"].astype(np.int64))
     elements = model.tracks
     cut = np.isin(code(elements["image"], elements["key"]), code(ids, assembled.keys)[gone])
-    touched = np.union1d(point[cut], assembled.points[problem.point_index[gone]])
-    left = np.bincount(point[~cut], minlength=len(heads))
+    touched = assembled.points[problem.point_index[gone]]
+    left = np.bincount(assembled.points[problem.point_index[~gone]], minlength=len(heads))  # tracks may be wrong
     drop = np.zeros(len(heads), bool)
     drop[touched] = left[touched] < MIN_TRACK
     for image in images.values():
@@ -123,7 +123,7 @@ def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observ
         keys["point"][np.isin(keys["point"], heads["id"][drop])] = records.NO_POINT
         images[image.id] = replace(image, keys=keys)
     heads = heads.copy()
-    heads["length"] = left
+    heads["length"] = np.bincount(point[~cut], minlength=len(heads))
     return replace(model, images=images, points=heads[~drop], tracks=elements[~cut & ~drop[point]])
 
 
