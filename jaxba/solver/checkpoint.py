@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-import zipfile
+import zlib
 from dataclasses import replace
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import jax
 import numpy as np
@@ -83,7 +84,8 @@ class Checkpoint:
             there = [found.get(f"problem {k}", leaf) for k, leaf in enumerate(self._start)]
             costs = float(found["initial_cost"]), float(found["total_s"])
             return Saved(jax.tree.unflatten(self._tree, there), found["away"], *costs, steps, _numbered(found, "carry"))
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        # one array is a TypeError; flipped bytes may name another compression, or say that there is a password
+        except (OSError, LookupError, ValueError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
             if isinstance(error, ProblemError):
                 raise
             raise ProblemError(f"{self._path} is no checkpoint: {error}") from error

@@ -146,8 +146,8 @@ def read_recording(path: StrPath) -> Recording:
         return Recording(problem, int(found["whole"]), points=points, source=str(found["source"]), **history)
     except OSError as error:
         raise ProblemError(f"cannot read {name}: {reason(error)}") from None
-    # zipfile raises the NotImplementedError, for a compression that a flipped byte names
-    except (ValueError, KeyError, IndexError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
+    # zipfile raises the RuntimeError, for a compression that a flipped byte names, or a password
+    except (ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
         raise ProblemError(f"{name}: is not a recording of jaxba-solve --record") from None
 
 

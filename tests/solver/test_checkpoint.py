@@ -98,8 +98,13 @@ def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):
     for other, policy in ((problem.replace(points=problem.points + 1e-3), "ceres"), (problem, "nielsen")):
         with pytest.raises(ProblemError, match=r"solve.npz is the checkpoint of another problem, policy or options"):
             solve(other, policy, options, checkpoint=file)
-    file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(ProblemError, match=r"solve.npz is no checkpoint"):
-        solve(problem, "ceres", options, checkpoint=file)
+    whole, array = file.read_bytes(), tmp_path / "array.npy"
+    np.save(array, np.zeros(3))
+    compression, flags = whole.rindex(b"PK\x01\x02") + 10, whole.rindex(b"PK\x01\x02") + 8  # of the last member
+    flipped = [whole[:at] + b"\x01" + whole[at + 1 :] for at in (compression, flags)]
+    for damaged in (whole[:100], array.read_bytes(), *flipped):
+        file.write_bytes(damaged)
+        with pytest.raises(ProblemError, match=r"solve.npz is no checkpoint"):
+            solve(problem, "ceres", options, checkpoint=file)
     with pytest.raises(ProblemError, match="cannot write"):
         solve(problem, "ceres", options, checkpoint=tmp_path / "missing" / "solve.npz")

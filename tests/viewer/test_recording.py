@@ -59,7 +59,10 @@ def test_a_recording_comes_back_from_its_file(recorded, tmp_path):
 def test_what_is_no_recording_is_refused_in_one_line(tmp_path):
     (tmp_path / "text.npz").write_text("no archive")
     np.savez(tmp_path / "other.npz", a=1)
-    for name in ("text.npz", "other.npz"):
+    data = (tmp_path / "other.npz").read_bytes()
+    flags = data.rindex(b"PK\x01\x02") + 8  # the first says that a password is needed
+    (tmp_path / "locked.npz").write_bytes(data[:flags] + b"\x01" + data[flags + 1 :])
+    for name in ("text.npz", "other.npz", "locked.npz"):
         with pytest.raises(jaxba.ProblemError, match="is not a recording"):
             read_recording(str(tmp_path / name))
 
