@@ -129,7 +129,7 @@ def constrained(
             raise ValueError(f"must be one of {', '.join(get_args(Gauge))}, not {shown(gauge)}")
     for key, value in sorted(settings.items(), key=lambda item: item[0] != "part"):  # it says what is seen
         with _named(file, key):
-            problem = _apply(problem, f"{file}: {key}", key, value, strict)
+            problem = _apply(problem, f"{file}: {key}", key, value, strict, model)
     return Survey(problem, marks), gauge
 
 
@@ -152,9 +152,11 @@ def _as_text(value: Any) -> Any:
     return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: bool) -> BundleProblem:
+def _apply(
+    problem: BundleProblem, where: str, key: str, value: Any, strict: bool, model: StrPath | None
+) -> BundleProblem:
     if key in MEASURED:
-        return with_measured(problem, where, key, value, strict)
+        return with_measured(problem, where, key, value, strict, model)
     if key == "part":
         given = parse_mapping(value, (), tuple(OF_PART))
         chosen = {name: _wanted(problem, kind, given[name], name) for name, kind in OF_PART.items() if name in given}

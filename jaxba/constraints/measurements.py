@@ -10,12 +10,14 @@ from jaxtyping import Float, Int
 
 from jaxba import residuals
 from jaxba.constraints import values
-from jaxba.io.files import reason
+from jaxba.io.colmap.read import principal_points
+from jaxba.io.files import StrPath, reason
 from jaxba.io.notes import report
 from jaxba.io.positions import read_gravity
 from jaxba.model.registration import with_residual
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.hold import every_lens
 from jaxba.problem.labels import Part
 
@@ -29,13 +31,15 @@ MEASURED = {
 """Keys of the file, and what they hold."""
 
 
-def with_measured(problem: BundleProblem, where: str, key: str, value: Any, strict: bool) -> BundleProblem:
-    """The problem with what a key of `MEASURED` says.
+def with_measured(
+    problem: BundleProblem, where: str, key: str, value: Any, strict: bool, model: StrPath | None = None
+) -> BundleProblem:
+    """The problem, perhaps of a COLMAP model, with what a key of `MEASURED` says.
 
     What is measured of images and points that the problem does not have is left out with a note that begins with
     `where`, or refused if `strict`. Raises ValueError: something that the value cannot be; one line."""
     if key == "depths":
-        return _with_depths(problem, where, value, strict)
+        return _with_depths(problem, where, value, strict, model)
     kind, what, loss = "point" if key in ("control_points", "distances") else "image", "pairs", None
     if key == "distances":
         items, columns = values.parse_pairs(value, kind, {"length": ((),), "stddev": ((),)})
@@ -102,10 +106,11 @@ def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool) 
     report([f"{where}: left out {what}: {values.names_of(names)}"] if names else [])
 
 
-def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -> BundleProblem:
+def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool, model: StrPath | None) -> BundleProblem:
     """Depths from maps of the size of their images, each with a scale, at first the median, and a shift, at first 0.
 
-    Of a BAL lens, whose pixels do not say where the image is, the principal point is the middle of the map."""
+    Of a BAL lens, whose pixels do not say where the image is, the principal point is that of the model, or else the
+    middle of the map."""
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
     folder, loss = values.beside(where, value, "folder"), values.parse_loss(value)
     if not folder.is_dir():
@@ -118,10 +123,15 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
     leave_out(where, "image", "{} without a map", missing, strict)
     camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)
+    flip, origins, labels = np.ones(2), np.zeros((problem.num_cameras, 2)), problem.labels
+    if every_lens(problem).all_bal:
+        flip = COLMAP_FLIP[:2]
+        origins = None if labels is None or model is None else principal_points(model, labels.images.tolist())
     for at, file in enumerate(files):
         if file is not None:
             own = np.flatnonzero(camera == at)
-            measured[own] = _looked_up(file, np.asarray(problem.observations)[own], centred=every_lens(problem).all_bal)
+            pixels = np.asarray(problem.observations)[own] * flip
+            measured[own] = _looked_up(file, pixels, None if origins is None else origins[at])
     kept = np.flatnonzero(np.isfinite(measured))
     if not len(kept):
         raise ValueError(f"{folder}: no map has a depth at a pixel of the problem")
@@ -133,16 +143,16 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool) -
     return with_residual(problem, rows, loss=loss, unknowns={"image": start})
 
 
-def _looked_up(file: Path, pixels: Float[np.ndarray, "n 2"], *, centred: bool) -> Float[np.ndarray, " n"]:
-    """Depths of a map at pixels from its upper left corner, or its middle with y upwards; NaN where there is none."""
+def _looked_up(
+    file: Path, pixels: Float[np.ndarray, "n 2"], origin: Float[np.ndarray, "2"] | None
+) -> Float[np.ndarray, " n"]:
+    """Depths of a map at pixels from an origin in it; None: its middle. NaN where there is none."""
     try:
         depths = np.asarray(np.load(file, allow_pickle=False), np.float64)
         height, width = depths.shape
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(f"{file}: no matrix of depths: {reason(error)}") from None
-    if centred:
-        pixels = pixels * [1, -1] + [width / 2, height / 2]
-    column, row = np.floor(pixels).astype(int).T
+    column, row = np.floor(pixels + ([width / 2, height / 2] if origin is None else origin)).astype(int).T
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     found = depths[np.where(inside, row, 0), np.where(inside, column, 0)]
     return np.where(inside & (found > 0) & np.isfinite(found), found, np.nan)

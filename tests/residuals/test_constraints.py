@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import constrained
 
 import jaxba
-from jaxba import ProblemWarning, residuals
+from jaxba import ProblemWarning, residuals, write_colmap
 from jaxba.cli.common import UsageError
+from jaxba.io.colmap.files import read_model, write_model
 from jaxba.problem import geometry
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.labels import Labels
@@ -125,6 +128,33 @@ def test_depth_maps_are_looked_up_at_pixels_and_find_their_scales(model, problem
     start = found.residuals.blocks[0]
     assert start.shape == (4, 2)
     assert (np.abs(start[:, 0] - 2.15) < 0.15).all()
+
+
+def test_depth_maps_are_looked_up_from_the_principal_points_of_a_model(problem, tmp_path):
+    write_colmap(problem, tmp_path / "old")
+    model = read_model(tmp_path / "old")
+    move = np.array([40.0, -25.0])  # of principal points, and of all pixels with them
+    cameras = {
+        key: replace(one, params=(one.params[0], *(one.params[1:3] + move), *one.params[3:]))
+        for key, one in model.cameras.items()
+    }
+    images = {key: replace(one, keys=one.keys.copy()) for key, one in model.images.items()}
+    for image in images.values():
+        image.keys["xy"] += move
+    write_model(replace(model, cameras=cameras, images=images), tmp_path / "new", ".bin")
+    for image in images.values():
+        camera = cameras[image.camera]
+        depths = np.zeros((camera.height + 99, camera.width + 99))
+        column, row = np.floor(image.keys["xy"]).astype(int).T
+        depths[row, column] = image.keys["point"]
+        np.save(tmp_path / f"{image.name.decode()}.npy", depths)
+    found = jaxba.read_problem(tmp_path / "new")
+    constraints = tmp_path / "c.yaml"
+    constraints.write_text("depths: {folder: ., stddev: 0.1}")
+    index, of = data(jaxba.survey(found, constraints, model=tmp_path / "new").problem)
+    assert len(index[0]) > found.num_observations / 2
+    assert found.labels is not None
+    np.testing.assert_array_equal(of["measured"], found.labels.points[index[1]])
 
 
 @pytest.mark.parametrize(
