@@ -19,7 +19,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import formats, is_colmap
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.runtime.atomic import write_text
+from jaxba.runtime.atomic import atomic_write
 from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
 from jaxba.solver.many import Result, solve_many
 from jaxba.solver.options import SolveOptions
@@ -102,7 +102,7 @@ def solve_all(
     done = _begin(folder, paths, names, resume=args.resume) if folder else {}
     left = [(path, name) for path, name in zip(paths, names, strict=True) if name not in done]
     if done:
-        common.print_line(f"{len(done)} of {len(paths)} are there already")
+        common.print_line(f"{len(paths) - len(left)} of {len(paths)} are there already")
     common.prepare_process()
     began, shown, rows = time.monotonic(), -1e9, list[Row]()
     every, end = (PROGRESS_S[0], "") if sys.stderr.isatty() else (PROGRESS_S[1], "\n")
@@ -185,16 +185,17 @@ def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], *, resume: 
     if costs.exists():
         common.require(resume, f"--output {folder}: holds {COSTS} of an earlier run; --resume goes on with it")
         content = costs.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1].decode()
-        rows = {row[0]: row for row in list(csv.reader(whole.splitlines()))[1:] if not row[-1]}
+        whole = io.StringIO(os.fsdecode(content[: content.rfind(b"\n") + 1]), newline="")
+        rows = {row[0]: row for row in list(csv.reader(whole))[1:] if row and not row[-1]}
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([Row._fields, *rows.values()])
-    write_text(costs, text.getvalue())
+    with atomic_write(costs) as file:
+        file.write(os.fsencode(text.getvalue()))  # names of files may be no text
     return rows
 
 
 def _append(costs: Path, row: Row) -> None:
-    with costs.open("a", newline="", encoding="utf-8") as file:
+    with costs.open("a", newline="", encoding="utf-8", errors="surrogateescape") as file:
         csv.writer(file, lineterminator="\n").writerow(row)
 
 

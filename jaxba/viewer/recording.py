@@ -111,10 +111,11 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 def write_recording(recording: Recording, path: StrPath) -> None:
     """Writes a recording, whole or not at all; points are float32 from their middle. Raises ProblemError."""
     problem, lenses = recording.problem, recording.problem.lenses
-    middle = np.median(recording.points[-1], axis=0)
+    middle, limits = np.median(recording.points[-1], axis=0), np.finfo(np.float32)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
     arrays |= {name: getattr(recording, name) for name in _HISTORY}
-    arrays |= {"points": (recording.points - middle).astype(np.float32), "middle": middle}
+    points = np.clip(recording.points - middle, limits.min, limits.max)  # some run away
+    arrays |= {"points": points.astype(np.float32), "middle": middle}
     arrays |= {"whole": recording.whole, "source": recording.source}
     if lenses is not None:
         model = np.zeros(len(lenses.free), np.int32) if lenses.model is None else lenses.model

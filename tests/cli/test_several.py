@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 
 import numpy as np
 import pytest
@@ -88,6 +89,25 @@ def test_a_run_goes_on_where_it_was_also_after_a_line_that_was_cut(problems, tmp
     assert found[0] == first[0]
     assert found[1]["final_cost"]
     assert sorted(one.name for one in output.iterdir()) == [COSTS, "scene-1.txt.gz", "scene-2.txt.gz"]
+
+
+def test_a_run_goes_on_with_names_of_any_bytes_and_costs_that_an_editor_or_a_crash_has_touched(
+    problems, tmp_path, capsys
+):
+    output, first = tmp_path / "solved", problems / "scene-0.txt.gz"
+    odd = problems / os.fsdecode(b'a \xe9\x85\n,".txt.gz')
+    first.rename(odd)
+    assert run([str(problems), "--output", str(output), *ASKED]) == 0
+    costs = output / COSTS
+    whole = costs.read_bytes()
+    costs.write_bytes(whole + b"\n\0\0\xff\n")
+    capsys.readouterr()
+    again = [str(odd), str(problems / "scene-1.txt.gz"), "--output", str(output), "--resume", *ASKED]
+    assert run(again) == 0
+    printed = capsys.readouterr()
+    assert "2 of 2 are there already" in printed.out
+    assert "0 problems solved, 0 failed" in printed.out
+    assert costs.read_bytes().startswith(whole)
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,18 @@ def test_a_recording_comes_back_from_its_file(recorded, tmp_path):
         np.testing.assert_array_equal(getattr(back, name), getattr(recording, name))
 
 
+def test_a_point_that_has_run_away_leaves_the_rest_of_a_recording(recorded, tmp_path):
+    recording = recorded[0]()
+    points = recording.points.copy()
+    points[-1, 3] = [1e200, -1e39, 0.0]  # beyond float32
+    write_recording(replace(recording, points=points), tmp_path / "run.npz")
+    back = read_recording(tmp_path / "run.npz").points
+    others = np.arange(points.shape[1]) != 3
+    np.testing.assert_allclose(back[:, others], points[:, others], rtol=1e-5, atol=1e-5)
+    assert back[-1, 3, 0] > 1e38
+    assert back[-1, 3, 1] < -1e38
+
+
 def test_what_is_no_recording_is_refused_in_one_line(tmp_path):
     (tmp_path / "text.npz").write_text("no archive")
     np.savez(tmp_path / "other.npz", a=1)
