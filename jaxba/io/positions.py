@@ -7,6 +7,7 @@ import re
 import sqlite3
 from collections.abc import Iterable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -131,6 +132,7 @@ def _pose_priors(path: StrPath, *wanted: str) -> list[Any]:
     """Names of images with columns of their priors, which are None where the table does not have them."""
     try:
         with closing(sqlite3.connect(f"{Path(path).resolve().as_uri()}?mode=ro", uri=True)) as base:
+            base.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")  # as names in a model
             columns = [row[1] for row in base.execute("PRAGMA table_info(pose_priors)")]
             image, own = ("image_id", "") if "image_id" in columns else ("corr_data_id", "AND corr_sensor_type = 0")
             names = ", ".join(one if one in columns else "NULL" for one in wanted)
@@ -138,7 +140,7 @@ def _pose_priors(path: StrPath, *wanted: str) -> list[Any]:
                 f"SELECT name, {names} FROM pose_priors JOIN images "
                 f"ON images.image_id = pose_priors.{image} {own} ORDER BY images.image_id"
             ).fetchall()
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:  # UnicodeError: of a damaged schema, in SQLite's own message
         raise ProblemError(f"{display_name(path)}: is no database of COLMAP with positions: {reason(error)}") from None
 
 

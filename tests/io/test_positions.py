@@ -153,6 +153,15 @@ def test_a_database_of_an_earlier_colmap_has_positions_by_image(tmp_path):
     assert (places == PLACES[:2]).all()
 
 
+def test_names_in_a_database_may_be_any_bytes_as_in_a_model(tmp_path):
+    old_database(tmp_path / "d.db")
+    base = sqlite3.connect(tmp_path / "d.db")
+    base.execute("UPDATE images SET name = CAST(x'E92E6A7067' AS TEXT) WHERE image_id = 2")  # \xe9.jpg in Latin-1
+    base.commit()
+    base.close()
+    assert read_database(tmp_path / "d.db").names == ["a.jpg", b"\xe9.jpg".decode("utf-8", "surrogateescape")]
+
+
 @pytest.mark.extra
 @pytest.mark.parametrize("geographic", [True, False])
 def test_a_database_of_pycolmap_has_positions_and_covariances(geographic, tmp_path):
