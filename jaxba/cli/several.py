@@ -18,6 +18,7 @@ from jaxba.cli.overwriting import check_apart, problem_files
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import formats, is_colmap
+from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import atomic_write
 from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
@@ -116,8 +117,8 @@ def solve_all(
                 _append(folder / COSTS, rows[-1])
             now = time.monotonic()
             if not isinstance(result, Solution):
-                text = rows[-1].error
-                common.print_error(text if text.startswith(path) else f"{path}: {text}")
+                text, known = rows[-1].error, display_name(path)
+                common.print_error(text if text.startswith(known) else f"{known}: {text}")
             elif now - shown > every:
                 rate, shown = len(rows) / (now - began), now
                 text = f"{len(rows)} of {len(left)}, {rate:.1f} a second"
