@@ -135,8 +135,11 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     free_points = np.ones(problem.num_points, bool)
     if problem.constants is not None:
         free_points &= ~np.asarray(problem.constants.points)
-    system = _system(layout, linear, index, count, free_points)
-    inverse, null = _inverse(system)
+    try:
+        system = _system(layout, linear, index, count, free_points)
+        inverse, null = _inverse(system)
+    except np.linalg.LinAlgError:
+        raise ProblemError("there are no covariances: derivatives of the pixels overflow") from None
     marginal, lost_by_cameras = _marginal(system, inverse, null)
     given_cameras = system.turn @ system.inverse @ system.turn.transpose(0, 2, 1)
     own = slice(given.num_points)  # without those that stand for rows of residuals

@@ -7,7 +7,7 @@ import pytest
 import support
 from support import solved
 
-from jaxba import BundleProblem, ProblemWarning, StepOptions, covariance, hold, with_gauge
+from jaxba import BundleProblem, ProblemError, ProblemWarning, StepOptions, covariance, hold, with_gauge
 from jaxba.problem.labels import Labels
 from jaxba.problem.options import Coordinates
 
@@ -84,3 +84,12 @@ def test_a_point_that_is_nearly_not_determined_changes_no_other_covariance():
         near = lambda x: np.diagonal(x, axis1=1, axis2=2)
         assert (near(found.points[others]) <= near(wanted.points[others]) * (1 + 1e-6)).all()
         assert (near(found.poses) <= near(wanted.poses) * (1 + 1e-6)).all()
+
+
+def test_derivatives_that_overflow_are_one_line():
+    cameras, points = np.array(solved().cameras), np.array(solved().points)
+    point = solved().point_index[solved().camera_index == 0][0]
+    cameras[0, :6], points[point] = 0.0, [1.0, 1.0, -1e-70]  # nearly in the plane of a camera
+    problem = hold(solved().replace(cameras=cameras, points=points), poses=[0, 1])
+    with pytest.raises(ProblemError, match="no covariances: derivatives of the pixels overflow"):
+        covariance(problem)
