@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+import warnings
 import zlib
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ import numpy as np
 
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.runtime.atomic import atomic_write
 from jaxba.solver.iteration import Carry
 from jaxba.solver.options import SolveOptions
@@ -57,9 +58,11 @@ class Checkpoint:
     def __init__(
         self, path: str | os.PathLike[str], problem: BundleProblem, policy: Any, options: SolveOptions
     ) -> None:
-        """Raises ValueError: there are several processes."""
+        """Raises ValueError: there are several processes. Raises ProblemError: the folder of the file is missing."""
         if jax.process_count() > 1:
             raise ValueError("a checkpoint is of one process")
+        if not os.path.isdir(os.path.dirname(os.path.abspath(path))):
+            raise ProblemError(f"cannot write {path}: its folder is missing")
         options = replace(options, max_iterations=1, tolerances=Tolerances())
         numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
         settings = policy, numbers, options
@@ -96,7 +99,7 @@ class Checkpoint:
         return time.monotonic() - self._last > EVERY_S
 
     def save(self, saved: Saved) -> None:
-        """Replaces the file. Raises ProblemError: it cannot be written."""
+        """Replaces the file. Warns with a ProblemWarning if it cannot be written: the solve is worth more."""
         pairs = enumerate(zip(jax.tree.leaves(saved.problem), self._start, strict=True))
         parts: dict[str, Any] = {f"problem {k}": now for k, (now, start) in pairs if now is not start}
         parts |= {f"step {k}": column for k, column in enumerate(zip(*saved.steps, strict=True))}
@@ -107,7 +110,8 @@ class Checkpoint:
             with atomic_write(self._path) as file:
                 np.savez(file, **parts)
         except OSError as error:
-            raise ProblemError(f"cannot write {self._path}: {error.strerror or error}") from error
+            text = f"cannot write {self._path}: {error.strerror or error}; the solve goes on"
+            warnings.warn(text, ProblemWarning, stacklevel=2)
         self._last = time.monotonic()
 
 

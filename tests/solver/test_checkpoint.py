@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import replace
 
 import numpy as np
@@ -108,3 +109,14 @@ def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):
             solve(problem, "ceres", options, checkpoint=file)
     with pytest.raises(ProblemError, match="cannot write"):
         solve(problem, "ceres", options, checkpoint=tmp_path / "missing" / "solve.npz")
+
+
+def test_a_solve_whose_checkpoint_cannot_be_written_goes_on(tmp_path, monkeypatch):
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "atomic_write", full)
+    options = SolveOptions(max_iterations=2)
+    with pytest.warns(jaxba.ProblemWarning, match=r"solve.npz: No space left on device; the solve goes on"):
+        found = solve(support.tiny(), "ceres", options, checkpoint=tmp_path / "solve.npz")
+    assert found.iterations == 2
