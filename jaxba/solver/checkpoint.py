@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import time
 import warnings
 import zlib
@@ -63,12 +64,13 @@ class Checkpoint:
             raise ValueError("a checkpoint is of one process")
         if not os.path.isdir(os.path.dirname(os.path.abspath(path))):
             raise ProblemError(f"cannot write {path}: its folder is missing")
-        options = replace(options, max_iterations=1, tolerances=Tolerances())
+        options = replace(options, max_iterations=1, tolerances=Tolerances(), within=0.0)
         numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
-        settings = policy, numbers, options
-        self._path, self._last = path, time.monotonic()
+        self._path, self._last, self._labels = path, time.monotonic(), problem.labels
         self._start, self._tree = jax.tree.flatten(problem)
-        found = hashlib.blake2b(repr(settings).encode())
+        # functions by their names: each process has them at other addresses
+        settings = re.sub(" at 0x[0-9a-f]+", "", repr((policy, numbers, options, self._tree)))
+        found = hashlib.blake2b(settings.encode())
         for leaf in self._start:
             found.update(np.ascontiguousarray(leaf).data)
         self._key = found.hexdigest()
@@ -86,7 +88,8 @@ class Checkpoint:
             steps = [StepInfo(*(x.item() for x in row)) for row in zip(*_numbered(found, "step"), strict=True)]
             there = [found.get(f"problem {k}", leaf) for k, leaf in enumerate(self._start)]
             costs = float(found["initial_cost"]), float(found["total_s"])
-            return Saved(jax.tree.unflatten(self._tree, there), found["away"], *costs, steps, _numbered(found, "carry"))
+            problem = jax.tree.unflatten(self._tree, there).replace(labels=self._labels)
+            return Saved(problem, found["away"], *costs, steps, _numbered(found, "carry"))
         # one array is a TypeError; flipped bytes may name another compression, or say that there is a password
         except (OSError, LookupError, ValueError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
             if isinstance(error, ProblemError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import types
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ import support
 import jaxba
 from jaxba import ProblemError, SolveOptions, solve
 from jaxba.problem import geometry
+from jaxba.problem.labels import Labels
 from jaxba.solver import checkpoint, sharded
 
 OPTIONS = SolveOptions(linear_solver="implicit", max_iterations=8, tolerances=jaxba.Tolerances(ftol=0.0))
@@ -120,3 +122,42 @@ def test_a_solve_whose_checkpoint_cannot_be_written_goes_on(tmp_path, monkeypatc
     with pytest.warns(jaxba.ProblemWarning, match=r"solve.npz: No space left on device; the solve goes on"):
         found = solve(support.tiny(), "ceres", options, checkpoint=tmp_path / "solve.npz")
     assert found.iterations == 2
+
+
+def own_loss(s):
+    return s / (1 + s)
+
+
+def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance(tmp_path):
+    problem, file = support.tiny(), tmp_path / "solve.npz"
+    options = SolveOptions(max_iterations=2, loss=jaxba.Loss(own_loss, 2.0))
+    solve(problem, "ceres", options, checkpoint=file)
+    # functions have other addresses in another process
+    elsewhere = types.FunctionType(own_loss.__code__, globals(), "own_loss")
+    options = replace(options, loss=jaxba.Loss(elsewhere, 2.0), max_iterations=3, within=1e-12)
+    numbers = []
+    solve(problem, "ceres", options, checkpoint=file, callback=lambda record: numbers.append(record.iteration))
+    assert numbers == [3]
+
+
+def test_functions_and_losses_of_residuals_belong_to_a_checkpoint(tmp_path):
+    problem, file, rows = support.tiny(), tmp_path / "solve.npz", scaled(size=0, pose=[0, 1], measured=0.5)
+    options = SolveOptions(max_iterations=1)
+    registered = lambda rows, loss: jaxba.with_residual(problem, rows, unknowns={"size": [[1.0]]}, loss=loss)
+    solve(registered(rows, jaxba.Loss()), "ceres", options, checkpoint=file)
+    for other in (registered(rows, jaxba.Loss("cauchy")), registered(raised(size=0, pose=[0, 1], measured=0.5), None)):
+        with pytest.raises(ProblemError, match="the checkpoint of another problem, policy or options"):
+            solve(other, "ceres", options, checkpoint=file)
+
+
+@jaxba.residual
+def raised(size, pose, *, measured):
+    return size[0] * pose.center[2] - measured
+
+
+def test_names_of_images_are_there_after_a_solve_continues(tmp_path):
+    labels = Labels(tuple("abcdef"), np.arange(6), np.arange(6), np.arange(40))
+    problem, file = support.tiny().replace(labels=labels), tmp_path / "solve.npz"
+    for limit in (1, 2):
+        found = solve(problem, "ceres", SolveOptions(max_iterations=limit), checkpoint=file)
+        assert found.problem.labels == labels
