@@ -23,9 +23,11 @@ def in_frames(problem: BundleProblem) -> BundleProblem:
     if rigs is None:
         return problem
     frame, cameras = np.asarray(rigs.frame), np.asarray(problem.cameras)
-    seen = np.unique(problem.camera_index)
+    seen = np.flatnonzero(observed(problem)[0])
     if len(np.unique(frame[seen])) == len(seen):
-        return problem.replace(rigs=None)
+        held = problem.constants  # also by cameras of a frame that nothing sees
+        held = held and replace(held, poses=~free_poses(problem)[:, :POSE_SIZE])
+        return problem.replace(rigs=None, constants=held)
     rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
     of_frame, at = frame_poses(rotation, translation, cameras)
     poses = np.hstack([angle_axis(of_frame), at])

@@ -16,12 +16,15 @@ from jaxba import (
     Rigs,
     SolveOptions,
     StepOptions,
+    Tolerances,
     covariance,
     hold,
     lm_step,
+    residuals,
     solve,
     with_gauge,
     with_position_priors,
+    with_residual,
     with_rotation_priors,
 )
 from jaxba.problem import geometry
@@ -263,6 +266,41 @@ def test_a_camera_that_nothing_sees_moves_with_its_frame():
     after = solve(blind, "ceres").problem
     assert (after.cameras[2, :6] != problem.cameras[2, :6]).any()
     BundleProblem.create(after.cameras, *support.arrays(after)[1:], rigs=after.rigs)
+
+
+def one_sensor() -> BundleProblem:
+    """`rigged`, of which each frame has pixels of one camera alone."""
+    problem = rigged()
+    return problem.subset(~np.isin(problem.camera_index, [2, 4]))
+
+
+def test_what_is_measured_of_a_camera_without_pixels_moves_its_frame():
+    problem, images, seen = one_sensor(), [2, 4, 3, 5], [0, 1, 3, 5]
+    measured = geometry.camera_centers(problem.cameras)[images] + np.random.default_rng(0).normal(size=(4, 3))
+    options = SolveOptions(tolerances=Tolerances(ftol=1e-12), max_iterations=300)
+    surveyed = with_position_priors(problem, measured, stddev=0.1, images=images, align=False)
+    found = solve(surveyed, "ceres", options)
+    after = found.problem
+    BundleProblem.create(after.cameras, *support.arrays(after)[1:], rigs=after.rigs)
+    # as if the cameras with pixels had the measurements, by lever arms in COLMAP's axes
+    turn, place = np.asarray(problem.rigs.rotation), np.asarray(problem.rigs.translation)
+    arms = place[seen] - np.einsum("nij,nkj,nk->ni", turn[seen], turn[images], place[images])
+    rows = residuals.position(pose=seen, position=measured, lever_arm=arms * [1, -1, -1], whitening=10 * np.eye(3))
+    alone = solve(with_residual(problem.replace(rigs=None), rows), "ceres", options)
+    np.testing.assert_allclose(found.initial_cost, alone.initial_cost, rtol=1e-9)
+    np.testing.assert_allclose(found.final_cost, alone.final_cost, rtol=1e-6)
+    assert found.final_cost > 2 * solve(problem, "ceres").final_cost
+
+
+def test_a_constant_camera_without_pixels_holds_its_frame():
+    problem = hold(one_sensor(), poses=[2])
+    found = solve(problem, "ceres")
+    after = found.problem
+    np.testing.assert_array_equal(after.cameras[2, :6], problem.cameras[2, :6])
+    np.testing.assert_allclose(after.cameras[0, :6], problem.cameras[0, :6], rtol=1e-12)
+    BundleProblem.create(after.cameras, *support.arrays(after)[1:], rigs=after.rigs)
+    direct = hold(one_sensor(), poses=[0])
+    assert found.num_parameters == solve(direct, "ceres").num_parameters
 
 
 def test_rigs_grow_with_their_scene():
