@@ -28,13 +28,13 @@ def _huber(s: Array) -> tuple[Array, Array]:
 
 def _soft_l1(s: Array) -> tuple[Array, Array]:
     root = jnp.sqrt(1 + s)
-    return 2 * (root - 1), 1 / root
+    return s * (2 / (1 + root)), 1 / root  # 2 (root - 1) without cancellation
 
 
 def _tukey(s: Array) -> tuple[Array, Array]:
-    rest = jnp.maximum(1 - s, 0)
-    value = (1 - rest**3) / 3
-    return jnp.where(jnp.isfinite(s), value, s), rest**2  # nan and inf must not pass as outliers
+    inside = jnp.minimum(s, 1)
+    value = inside * (1 - inside + inside**2 / 3)  # (1 - (1 - s)^3) / 3 without cancellation
+    return jnp.where(jnp.isfinite(s), value, s), (1 - inside) ** 2  # nan and inf must not pass as outliers
 
 
 _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
@@ -79,6 +79,10 @@ class Loss:
         area = self.scale * self.scale
         if callable(self.rho):
             value, slope = jax.jvp(self.rho, (squared / area,), (jnp.ones_like(squared),))
+            if value.shape != squared.shape:
+                raise ValueError(
+                    f"a loss is elementwise: {shown(self.rho)} of shape {squared.shape} gave {value.shape}"
+                )
         else:
             value, slope = _SHAPES[self.rho](squared / area)
         return area * value, slope

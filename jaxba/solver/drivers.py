@@ -47,7 +47,7 @@ rounded up to a power of two."""
 
 def record_length(max_iterations: int) -> int:
     """The length of the record of a compiled loop."""
-    return max(MIN_LENGTH, 1 << (max(1, max_iterations) - 1).bit_length())
+    return max(MIN_LENGTH, 1 << (max(1, int(max_iterations)) - 1).bit_length())
 
 
 class Driver:

@@ -55,6 +55,13 @@ def test_small_residuals_cost_what_they_cost_without_a_loss(name):
     assert (value <= SQUARES * (1 + 1e-15) + 1e-15 * 3.0**2).all()
     assert ((slope >= 0) & (slope <= 1)).all()
     assert (np.diff(np.sort(value)) >= 0).all()
+    wide, _ = Loss(name, 1e9)(jnp.asarray(SQUARES))
+    np.testing.assert_allclose(wide, SQUARES, rtol=1e-9, atol=1e-200)
+
+
+def test_a_loss_of_ones_own_that_is_not_elementwise_is_refused_in_one_line():
+    with pytest.raises(ValueError, match=r"a loss is elementwise: .* of shape \(207,\) gave \(\)"):
+        Loss(lambda s: jnp.sum(s))(jnp.asarray(SQUARES))
 
 
 def test_only_the_squared_loss_is_trivial_and_it_ignores_its_scale():
