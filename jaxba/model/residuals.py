@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.model.row_derivatives import differentiated, values
 from jaxba.problem.residuals import POINT, Rows
@@ -55,7 +55,7 @@ def add_point_terms(
     it at each, since these do not move alone (`points_alone`)."""
     sums, cost = list(sums), 9 if len(sums) > 1 else 0
     for rows in layout.residuals:
-        at = jnp.asarray(layout.slot_point).at[rows.slots[0]].get(mode="fill", fill_value=layout.num_points)
+        at = _points_of(layout, rows)
         if not cost or POINT not in rows.rows.residual.unknowns or len(rows.points) > 1:
             own = row_costs(rows.rows, values(rows, layout.unknowns, cameras, points))
             for end in at[: len(rows.points)]:
@@ -69,12 +69,18 @@ def add_point_terms(
     return sums
 
 
+def _points_of(layout: Layout, rows: ResidualSlots) -> Int[Array, "ends rows"]:
+    """The points at the slots of rows; out of range for a row that is none, as of a shard without rows."""
+    return jnp.asarray(layout.slot_point).at[rows.slots[0]].get(mode="fill", fill_value=layout.num_points)
+
+
 def points_alone(layout: Layout) -> Mask:
     """Which points may move while all others stay: those that are free, and in no row with another point."""
-    free, pairs = layout.unknowns.free_points, [own for x in layout.residuals if len(x.points) > 1 for own in x.points]
+    free, pairs = layout.unknowns.free_points, [_points_of(layout, x) for x in layout.residuals if len(x.points) > 1]
     if not pairs:
         return free
-    return Mask(free.where(jnp.ones(layout.num_points, bool).at[jnp.concatenate(pairs)].set(False), False), False)
+    alone = jnp.ones(layout.num_points, bool).at[jnp.concatenate(pairs, axis=1)].set(False, mode="drop")
+    return Mask(free.where(alone, False), False)
 
 
 def linearized(

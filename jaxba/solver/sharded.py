@@ -93,11 +93,14 @@ class Shards:
         parts. The problem is `in_frames` if it has rigs; the devices are those of all processes. Raises ProblemError:
         the method of the options works on one device only, or there are too few points."""
         check_plain(options, ProblemError, devices=True)
-        self._devices, self._parts = devices, parts
-        self._programs = ParallelCompilation()
+        self._devices, self._programs = devices, ParallelCompilation()
         self._mesh = Mesh(np.array(devices), (DEVICES,))
         dealt = deal_points(problem, parts * len(devices), [rows.points for rows in problem.residuals.rows])
-        if not len(dealt[-1]):
+        if len(devices) == 1:  # rows of residuals keep points together, perhaps in fewer parts
+            dealt = [points for points in dealt if len(points)]
+            parts = len(dealt)
+        self._parts = parts
+        if not min(map(len, dealt)):
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         here = [points for k, points in enumerate(dealt) if _is_here(devices[k // parts])]
         layouts = sharded_layout(shards_of(problem, here), options, distributed.gather)

@@ -155,6 +155,22 @@ def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(
     np.testing.assert_allclose(geometry.cost(in_parts.problem), geometry.cost(whole.problem), rtol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "policy"),
+    [(0, 3, "ceres+refine2"), pytest.param(range(149), range(1, 150), "ceres", marks=pytest.mark.slow)],
+    ids=["rows_of_one_part", "a_row_between_all_points"],
+)
+def test_rows_of_two_points_may_be_in_one_part_alone(first, second, policy, monkeypatch):
+    problem = jaxba.with_residual(sequence(), bar(point=first, point_2=second, length=60.0), loss=jaxba.Loss("huber"))
+    options = SolveOptions(linear_solver="implicit", max_iterations=4)
+    whole = solve(problem, policy, options)
+    monkeypatch.setattr(sharded, "LARGE", 1)
+    monkeypatch.setattr(sharded, "PART", problem.num_observations // 7)
+    monkeypatch.setattr(sharded, "PART_OF_CAMERA", 0)
+    in_parts = solve(problem, policy, options)
+    np.testing.assert_allclose(in_parts.history.cost, whole.history.cost, rtol=1e-9)
+
+
 def test_a_large_problem_of_many_cameras_has_a_part_at_least(monkeypatch):
     problem, options = sequence(), StepOptions(linear_solver="implicit")
     monkeypatch.setattr(sharded, "LARGE", 1)
