@@ -104,9 +104,8 @@ class Shards:
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         here = [points for k, points in enumerate(dealt) if _is_here(devices[k // parts])]
         layouts = sharded_layout(shards_of(problem, here), options, distributed.gather)
-        if parts > 1:
-            axes = (PARTS, DEVICES) if len(devices) > 1 else (PARTS,)
-            layouts = [replace(layout, axes=axes) for layout in layouts]
+        axes = (PARTS,) * (parts > 1) + (DEVICES,) * (len(devices) > 1)
+        layouts = [replace(layout, axes=axes) for layout in layouts]
         self.first = layouts[0]
         orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
         columns = list(zip(*map(jax.tree.leaves, layouts), strict=True))
