@@ -54,6 +54,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 def test_check_points_are_as_far_off_as_theory_says(solved):
     """The covariance of the marks is theory's; the RMS of twenty points is within a factor of it."""
     rows = rows_of(solved.folder)

@@ -34,6 +34,7 @@ KINDS = {
     "free places, a scale bar": 21,
     "no rigs, a constant pose": 3,
 }
+SLOW = ("free places, priors of positions", "constant places, surveyed points")
 
 
 @functools.partial(jax.jit, compiler_options=compiler_options("quick"))
@@ -51,7 +52,7 @@ def parts(layout, problem, damping):
 
 
 @pytest.mark.parametrize("damping", [1e-8, 1e-3])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS])
 def test_the_coarse_level_raises_the_least_eigenvalue_and_none_by_more_than_one(kind, damping, monkeypatch):
     monkeypatch.setattr(camera_clusters, "CLUSTER_CAMERAS", 4)
     problem = laid_out(in_frames(draw(KINDS[kind])[0]))

@@ -78,6 +78,7 @@ def test_the_gradient_of_a_weight_follows_the_chain_rule():
     assert slope * float(jax.grad(action)(0.0)) == pytest.approx(expected, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_the_input_is_errors_actions_and_rewards_of_the_last_steps():
     episode = start(1)
     first = episode.memory

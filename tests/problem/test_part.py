@@ -77,6 +77,7 @@ def test_a_shared_lens_is_refined_where_a_chosen_image_has_it():
     assert (solved.cameras[8:] == scene.cameras[8:]).all()
 
 
+@pytest.mark.slow
 def test_few_observed_cameras_are_solved_without_the_others_to_the_same_end(scene):
     part = jaxba.hold(jaxba.part(scene, images=LOCAL), poses=[2])
     small = observed_part(part)

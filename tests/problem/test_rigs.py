@@ -274,6 +274,7 @@ def one_sensor() -> BundleProblem:
     return problem.subset(~np.isin(problem.camera_index, [2, 4]))
 
 
+@pytest.mark.slow
 def test_what_is_measured_of_a_camera_without_pixels_moves_its_frame():
     problem, images, seen = one_sensor(), [2, 4, 3, 5], [0, 1, 3, 5]
     measured = geometry.camera_centers(problem.cameras)[images] + np.random.default_rng(0).normal(size=(4, 3))

@@ -148,6 +148,7 @@ def test_a_scale_bar_measures_the_distance_of_two_points():
     assert residuals.distance.function(one, two, length=4.5, sigma=0.1) == pytest.approx(5.0)
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_moves_as_the_camera_does():
     """Pixels of a camera that is moved in many small steps; a solve finds its velocities."""
     truth, _ = truth_and_start()

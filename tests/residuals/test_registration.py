@@ -219,6 +219,7 @@ def test_a_function_whose_globals_have_changed_is_compiled_anew():
     assert costs[1] == pytest.approx(100 * costs[0])
 
 
+@pytest.mark.slow
 def test_a_gauge_holds_no_scale_that_scale_bars_know():
     problem = jaxba.with_residual(scene(), distance(point=[0, 3], point_2=[7, 8], length=9.0, sigma=0.1))
     tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-14, 1e-14, 1e-14), max_iterations=300)
@@ -236,6 +237,7 @@ def test_a_problem_with_residuals_can_be_pickled_and_compared():
     assert "2 rows of position, 2 rows of relative_pose, 2 rows of apart, 5 rows of position_prior" in repr(problem)
 
 
+@pytest.mark.slow
 def test_points_are_looked_for_anew_with_all_residuals():
     problem = everything()
     points = problem.points.copy()

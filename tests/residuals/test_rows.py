@@ -192,7 +192,7 @@ def whole(problem: jaxba.BundleProblem, rows) -> tuple[np.ndarray, object]:
     return np.concatenate([np.ravel(x) for x in parts]), residuals
 
 
-QUICK = ("depth", "apart")
+QUICK = ("apart",)
 SLOW = [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow, id=what) for kind, what in KINDS.items()]
 
 
@@ -214,7 +214,7 @@ def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
 @pytest.mark.parametrize(
     ("policy", "linear_solver"),
     [
-        ("bold", "explicit"),
+        pytest.param("bold", "explicit", marks=pytest.mark.slow),
         pytest.param("ceres", "sparse", marks=pytest.mark.slow),
         pytest.param("bold", "implicit", marks=pytest.mark.slow),
     ],

@@ -114,7 +114,7 @@ def in_pairs(problem):
 @pytest.mark.parametrize(
     "kind",
     [
-        "shared lens",
+        pytest.param("shared lens", marks=pytest.mark.slow),
         "constants",
         pytest.param("priors", marks=pytest.mark.slow),
         pytest.param("rigs", marks=pytest.mark.slow),

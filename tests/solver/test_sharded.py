@@ -155,9 +155,10 @@ def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(
     np.testing.assert_allclose(geometry.cost(in_parts.problem), geometry.cost(whole.problem), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "policy"),
-    [(0, 3, "ceres+refine2"), pytest.param(range(149), range(1, 150), "ceres", marks=pytest.mark.slow)],
+    [(0, 3, "ceres+refine2"), (range(149), range(1, 150), "ceres")],
     ids=["rows_of_one_part", "a_row_between_all_points"],
 )
 def test_rows_of_two_points_may_be_in_one_part_alone(first, second, policy, monkeypatch):
