@@ -68,8 +68,10 @@ class Checkpoint:
         numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
         self._path, self._last, self._labels = path, time.monotonic(), problem.labels
         self._start, self._tree = jax.tree.flatten(problem)
-        # functions by their names: each process has them at other addresses
-        settings = re.sub(" at 0x[0-9a-f]+", "", repr((policy, numbers, options, self._tree)))
+        losses = options.loss, *(rows.loss for rows in problem.residuals.rows)
+        own = [jax.make_jaxpr(loss.rho)(np.zeros(1, np.float32)) for loss in losses if callable(loss.rho)]
+        # functions by what they compute: each process has them at other addresses
+        settings = re.sub(" at 0x[0-9a-f]+", "", repr((policy, numbers, options, self._tree, own)))
         found = hashlib.blake2b(settings.encode())
         for leaf in self._start:
             found.update(np.ascontiguousarray(leaf).data)

@@ -128,6 +128,13 @@ def own_loss(s):
     return s / (1 + s)
 
 
+def another_loss():
+    def own_loss(s):
+        return s / (1 + 0.5 * s)
+
+    return own_loss
+
+
 def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance(tmp_path):
     problem, file = support.tiny(), tmp_path / "solve.npz"
     options = SolveOptions(max_iterations=2, loss=jaxba.Loss(own_loss, 2.0))
@@ -138,6 +145,9 @@ def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance
     numbers = []
     solve(problem, "ceres", options, checkpoint=file, callback=lambda record: numbers.append(record.iteration))
     assert numbers == [3]
+    other = replace(options, loss=jaxba.Loss(another_loss(), 2.0))
+    with pytest.raises(ProblemError, match="the checkpoint of another problem, policy or options"):
+        solve(problem, "ceres", other, checkpoint=file)
 
 
 def test_functions_and_losses_of_residuals_belong_to_a_checkpoint(tmp_path):
