@@ -27,16 +27,17 @@ def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
 
 
 def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], float]:
-    """The marginal median of the observed points, and the larger of the median distances of them and of the cameras
-    that see them from it, scene units; zeros if nothing is observed."""
+    """The marginal median of the observed points, of the cameras if there are none as in a pose graph, and the larger
+    of the median distances of points and of cameras from it, scene units; zeros if nothing is observed."""
     cameras, points = observed(problem)
-    if not points.any():
-        return np.zeros(3), 0.0
     with np.errstate(all="ignore"):  # a scene that overflows is rejected later, with a message
         positions = np.asarray(problem.points, np.float64)[points]
         centers = camera_centers(np.asarray(problem.cameras, np.float64)[cameras])
-        middle = np.median(positions, axis=0)
-        return middle, max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (positions, centers))
+        places = [part for part in (positions, centers) if len(part)]
+        if not places:
+            return np.zeros(3), 0.0
+        middle = np.median(places[0], axis=0)
+        return middle, max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in places)
 
 
 def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool[np.ndarray, " points"]]:
