@@ -25,6 +25,9 @@ from jaxba.typing import InputError
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
 
+MISFIT = 3
+"""Exit status of `jaxba-solve --strict` where a solution was written, and what was measured does not fit it."""
+
 CACHE_VARIABLE = "JAXBA_CACHE"  # environment variable with the folder of compiled programs; `off` disables the cache
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
@@ -119,6 +122,14 @@ def print_error(message: str) -> int:
 def print_line(text: str) -> None:
     """Prints a line to stdout and flushes, so that it is read while the work goes on."""
     print(text, flush=True)
+
+
+def misfit_status(strict: bool, misfits: int) -> int:
+    """The exit status after solves with a number of notes on what does not fit, which `strict` tells from success."""
+    if not (strict and misfits):
+        return 0
+    print("error: --strict: what was measured does not fit, see the notes above", file=sys.stderr)
+    return MISFIT
 
 
 @contextmanager

@@ -59,6 +59,7 @@ class Row(NamedTuple):
     final_cost: float | str = ""
     iterations: int | str = ""
     end: str = ""  # why it ended
+    notes: str = ""  # what was measured and does not fit
     error: str = ""  # why there is no solution
 
     @classmethod
@@ -68,7 +69,8 @@ class Row(NamedTuple):
             return cls(name, error=" ".join(str(result).split()))
         problem = result.problem
         sizes = problem.num_cameras, problem.num_points, problem.num_observations
-        return cls(name, *sizes, result.initial_cost, result.final_cost, result.iterations, result.termination.reason)
+        costs, notes = (result.initial_cost, result.final_cost), "; ".join(result.notes)
+        return cls(name, *sizes, *costs, result.iterations, result.termination.reason, notes)
 
 
 def inputs(problems: Sequence[str]) -> list[str]:
@@ -93,7 +95,8 @@ def solve_all(
     options: SolveOptions,
 ) -> int:
     """Solves problems, `read` from their paths, and writes solutions under their names. One that fails is one line, and
-    the others go on. Exit status: 0, 2 if any has failed, 130 after Ctrl-C. Raises UsageError: the folder or the
+    the others go on. Exit status: 0, 2 if any has failed, 3 with `--strict` if what was measured does not fit some of
+    them, 130 after Ctrl-C. Raises UsageError: the folder or the
     options."""
     given = [f"--{name.replace('_', '-')}" for name in FOR_ONE if getattr(args, name)]
     common.require(not given, f"{', '.join(given)}: for one problem, not for {len(paths)}")
@@ -119,6 +122,8 @@ def solve_all(
             if not isinstance(result, Solution):
                 text, known = rows[-1].error, display_name(path)
                 common.print_error(text if text.startswith(known) else f"{known}: {text}")
+            elif rows[-1].notes:
+                common.print_line(f"note: {display_name(path)}: {rows[-1].notes}")
             elif now - shown > every:
                 rate, shown = len(rows) / (now - began), now
                 text = f"{len(rows)} of {len(left)}, {rate:.1f} a second"
@@ -139,7 +144,7 @@ def solve_all(
     if interrupt.requested and len(rows) < len(left):
         common.print_line(f"{len(left) - len(rows)} are left: --resume goes on")
         return INTERRUPTED
-    return common.BAD_INPUT if failed else 0
+    return common.BAD_INPUT if failed else common.misfit_status(args.strict, sum(bool(row.notes) for row in rows))
 
 
 class _Problems:

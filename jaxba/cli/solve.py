@@ -98,7 +98,8 @@ class Problem:
     """Width of its quadratic part, pixels."""
 
     strict: bool = False
-    """Fail instead of skipping invalid parts of the input."""
+    """Fail instead of skipping invalid parts of the input. Exit status 3 if what was measured does not fit; the
+    solution is written."""
 
 
 @options
@@ -232,8 +233,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 if a solution was found and written, 2 for bad input, 130 after a second
-    Ctrl-C."""
+    """Runs the command. Exit status: 0 if a solution was found and written, 2 for bad input, 3 with `--strict` if what
+    was measured does not fit the solution, 130 after a second Ctrl-C."""
     try:
         words = translated(sys.argv[1:] if argv is None else argv)
     except common.UsageError as error:
@@ -348,7 +349,7 @@ def _solve(args: Arguments) -> int:
         common.print_line(f"padded to {solution.capacity}")
     found = survey.report(solution)
     if found.rows:
-        common.print_line(str(found))
+        common.print_line(found.table())
     if args.survey:
         found.write(args.survey)
         common.print_line(f"wrote {args.survey}")
@@ -368,7 +369,7 @@ def _solve(args: Arguments) -> int:
             file.write(json.dumps(json_lines.plain(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
     end()
-    return 0
+    return common.misfit_status(args.strict, len(solution.notes))
 
 
 def _is_divided(args: Arguments) -> bool:

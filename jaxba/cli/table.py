@@ -81,7 +81,8 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
     """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
-    left_out, sizes = rejected(solution), (solution.num_residuals, solution.num_parameters)
+    left_out, notes = rejected(solution), solution.notes
+    sizes = solution.num_residuals, solution.num_parameters
     if solution.rejected is None:
         problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
     else:
@@ -100,6 +101,7 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     by_kind = [f"of it at the end: {', '.join(f'{name} {cost:.6e}' for name, cost in kinds)}"] if kinds else []
     distance = solution.distance
     left = f"; estimated within {distance:.1e} of the end" if math.isfinite(distance) else ""
+    misfits = [f"note: {note}" for note in notes]
     lines = [
         f"{state}: {solution.termination.reason}{left}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
@@ -109,7 +111,8 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]
-    return "\n".join([*lines, *left_out, *remarks(problem, solution), *without_weight(solution, loss or Loss())])
+    remarked = [*remarks(problem, solution), *without_weight(solution, loss or Loss())]
+    return "\n".join([*lines, *left_out, *misfits, *remarked])
 
 
 def rejected(solution: Solution) -> list[str]:

@@ -64,9 +64,9 @@ class Survey(ArrayRecord):
     """These marks."""
 
     def report(self, solution: Solution) -> Report:
-        """What a solve of the problem made of control points, check points and distances."""
+        """What a solve of the problem made of control points, check points and distances, and what does not fit."""
         problem, gone = solution.problem, solution.rejected
-        return report(problem if gone is None else problem.subset(~gone), self.marks)
+        return report(problem if gone is None else problem.subset(~gone), self.marks, solution.notes)
 
     def without_marks(self, solution: Solution) -> Solution:
         """A solution of the problem as of one without marks, such as is written."""

@@ -39,8 +39,15 @@ class Report:
     rows: tuple[Row, ...]
     """Control points, check points and distances."""
 
+    notes: tuple[str, ...] = ()
+    """What was measured and does not fit (`Solution.notes`)."""
+
     def __str__(self) -> str:
-        """The report in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
+        """The table, and the notes below it."""
+        return "\n".join([self.table(), *(f"note: {note}" for note in self.notes)])
+
+    def table(self) -> str:
+        """The rows in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
         lines, checks = [], [row.difference for row in self.rows if row.kind == "check" and row.images]
         for names, lengths in ((("x", "y", "z"), False), (("measured", "found", "less"), True)):
             if mine := [row for row in self.rows if (row.kind == "distance") == lengths]:
@@ -58,19 +65,23 @@ class Report:
         return "\n".join(lines)
 
     def write(self, path: StrPath) -> None:
-        """Writes the report as CSV. Raises ProblemError: it cannot be written."""
+        """Writes the report as CSV, each note as the name in a row of the kind `note`. Raises ProblemError: it cannot
+        be written."""
         out = io.StringIO()
         table = csv.writer(out, lineterminator="\n")
         table.writerow(COLUMNS)
         for row in self.rows:
             columns = [(*x, "") if len(x) == 3 else ("", "", "", *x) for x in (row.measured, row.difference)]
             table.writerow((row.kind, row.name, *columns[0], *columns[1], row.images, row.pixels, row.sigmas))
+        for note in self.notes:
+            table.writerow(("note", note, *[""] * (len(COLUMNS) - 2)))
         with open_output(path) as file:
             file.write(out.getvalue().encode())
 
 
-def report(problem: BundleProblem, marks: Marks | None) -> Report:
-    """The report of a solved problem and its marks, with the points and distances of the residuals that it has."""
+def report(problem: BundleProblem, marks: Marks | None, notes: tuple[str, ...] = ()) -> Report:
+    """The report of a solved problem and its marks, with the points and distances of the residuals that it has, and
+    notes on what does not fit."""
     first = problem.num_points - (0 if marks is None else len(marks.names))
     name = lambda one: part_name(problem.labels, "point", one).removeprefix("point ")
     groups, lengths = [], list[Row]()
@@ -92,9 +103,9 @@ def report(problem: BundleProblem, marks: Marks | None) -> Report:
     points = []
     for kinds, names, of, places, stddev in groups:
         found = found_at(problem, of, places, stddev)
-        known = np.where((np.array(kinds) == "check") & (found.images == 0), np.nan, 1)  # what says where they are
+        known = np.where(found.images > 0, 1, np.nan)  # else the measurement alone says where it is
         by, sigmas = found.difference * known[:, None], found.whitened * known
         columns = (places, by, sigmas, found.images, found.pixels)
         for kind, own, place, by, *more in zip(kinds, names, *(x.tolist() for x in columns), strict=True):
             points.append(Row(kind, own, tuple(place), tuple(by), *more))
-    return Report((*points, *lengths))
+    return Report((*points, *lengths), notes)

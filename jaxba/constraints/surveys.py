@@ -101,7 +101,8 @@ def with_control_points(
     if bal and model is not None:
         pixels = (pixels - principal_points(model, problem.labels.images[image].tolist())) * COLMAP_FLIP[:2]
     align = values.parse_truth("align", value.get("align", "true")) and not problem.residuals
-    problem = with_marks(problem, image, np.searchsorted(used, given.point[kept][seen]), pixels, sigma)
+    of_mark = np.searchsorted(used, given.point[kept][seen])
+    problem = with_marks(problem, image, of_mark, pixels, sigma, names)
     return _on_marks(problem, marks, values.parse_loss(value), align), marks
 
 

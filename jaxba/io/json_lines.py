@@ -10,7 +10,7 @@ import math
 import os
 import typing
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,13 +45,16 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], data: Any, path: str = "") -> T:
-    """The inverse of `plain`; ignores unknown keys. Raises ProblemError: a key is missing or of a wrong type."""
+    """The inverse of `plain`; ignores unknown keys. Raises ProblemError: a key without a default is missing, or one is
+    of a wrong type."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)
     values, above = {}, f"{path}." if path else ""
     for field in fields(kind):  # type: ignore[arg-type]
         key = key_of(field)
+        if key not in data and field.default is not MISSING:
+            continue
         if key not in data:
             raise ProblemError(f"{above}{key} is missing")
         values[field.name] = _value(hints[field.name], data[key], f"{above}{key}")

@@ -73,10 +73,18 @@ def costs_by_kind(problem: BundleProblem) -> dict[str, float]:
 
 def costs_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, " rows"]]:
     """The cost of every row of `problem.residuals.rows`."""
+    found = residuals_of_rows(problem)
+    with numerics(np.float64):
+        pairs = zip(problem.residuals.rows, found, strict=True)
+        return [np.asarray(row_costs(rows, jnp.asarray(residual.T))) for rows, residual in pairs]
+
+
+def residuals_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, "rows size"]]:
+    """What the functions return for every row of `problem.residuals.rows`, without the losses."""
     with numerics(np.float64):
         kinds, of, at = _rows_of(problem)
         values = program(model.values, level="quick")
-        return [np.asarray(row_costs(kind.rows, values(kind, of, *at))) for kind in kinds]
+        return [np.asarray(values(kind, of, *at)).T for kind in kinds]
 
 
 def _rows_of(problem: BundleProblem) -> tuple[tuple[ResidualSlots, ...], Unknowns, tuple[jax.Array, jax.Array]]:

@@ -30,10 +30,25 @@ class Labels(ArrayRecord):
     points: Integer[np.ndarray, " points"]
     """Ids of points."""
 
+    marks: tuple[str, ...] = ()
+    """Names of the last points, which a survey has (problem/marks.py)."""
+
     def of(self, cameras: Any, points: Any) -> Labels:
         """Those of some cameras and points."""
         names = np.array(self.names, object)[cameras].tolist()
-        return replace(self, names=tuple(names), images=self.images[cameras], points=self.points[points])
+        marks = [self.mark(at) for at in np.arange(len(self.points))[points].tolist()] if self.marks else []
+        return replace(
+            self,
+            names=tuple(names),
+            images=self.images[cameras],
+            points=self.points[points],
+            marks=tuple(name for name in marks if name),
+        )
+
+    def mark(self, point: int) -> str:
+        """Name of a point that a survey has; empty for others."""
+        number = point - (len(self.points) - len(self.marks))
+        return self.marks[number] if number >= 0 else ""
 
     def positions(self, kind: Part, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of parts by id, of images also by name. Raises ValueError: there is no such part; one line."""
@@ -55,7 +70,9 @@ def part_name(labels: Labels | None, kind: Part, at: int | np.integer) -> str:
         return f"{'camera' if kind == 'image' else kind} {at}"
     if kind == "image":
         return f"image {labels.images[at]} ({labels.names[at]})"
-    return f"camera {labels.lenses[at]}" if kind == "lens" else f"point {labels.points[at]}"
+    if kind == "lens":
+        return f"camera {labels.lenses[at]}"
+    return f"point {labels.mark(int(at)) or labels.points[at]}"
 
 
 def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], named: int = 1) -> str:

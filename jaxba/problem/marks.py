@@ -37,6 +37,12 @@ class Marks(ArrayRecord):
         return found.replace(labels=None if labels is None else labels.of(slice(None), kept))
 
 
+def of_marks(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
+    """Which observations are pixels of marks."""
+    count = 0 if problem.labels is None else len(problem.labels.marks)
+    return np.asarray(problem.point_index) >= problem.num_points - count
+
+
 class Found(NamedTuple):
     """How a problem has surveyed points."""
 
@@ -69,10 +75,20 @@ def with_marks(
     mark: Int[np.ndarray, " pixels"],
     pixels: Float[np.ndarray, "pixels 2"],
     sigma: float,
+    names: tuple[str, ...],
 ) -> BundleProblem:
-    """A problem without constants with marks as its last points, at pixels as in `observations`, of so many pixels
-    standard deviation. They start in the middle of what the first of their images sees."""
-    count = int(mark.max()) + 1
+    """A problem without constants with marks of some names as its last points, seen by images at pixels.
+
+    They start in the middle of what the first of their images sees.
+
+    Args:
+        problem: what the marks are added to.
+        image: image of each pixel.
+        mark: mark of each pixel, a position in `names`.
+        pixels: as in `observations`.
+        sigma: standard deviation of each number of a pixel, pixels.
+        names: names of the marks."""
+    count = len(names)
     points, camera, point = map(np.asarray, (problem.points, problem.camera_index, problem.point_index))
     seen = [points[point[camera == image[mark == one][0]]] for one in range(count)]
     starts = np.stack([np.median(own if len(own) else points, axis=0) for own in seen])
@@ -84,5 +100,5 @@ def with_marks(
         changes["whitening"] = joined(eye, np.tile(np.eye(2) / sigma, (len(pixels), 1, 1)))
     if (labels := problem.labels) is not None:
         ids = labels.points.max(initial=0) + 1 + np.arange(count)
-        changes["labels"] = replace(labels, points=joined(labels.points, ids))
+        changes["labels"] = replace(labels, points=joined(labels.points, ids), marks=names)
     return problem.replace(**changes)

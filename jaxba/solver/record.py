@@ -112,6 +112,9 @@ class Record:
     trace: tuple[TracePoint, ...]
     """The start and every iteration."""
 
+    notes: tuple[str, ...] = ()
+    """What was measured and does not fit (`Solution.notes`)."""
+
 
 def record_of(
     solution: Solution, steps: Sequence[IterationRecord], *, name: str, family: str, solver: SolverName, repeat: int = 0
@@ -144,4 +147,5 @@ def record_of(
         cg_iterations=int(solution.history.cg_iterations.sum()),
         termination=solution.termination.name.lower(),
         trace=tuple(trace),
+        notes=solution.notes,
     )

@@ -92,13 +92,26 @@ class Solution(ArrayRecord):
     rejected: Bool[np.ndarray, " observations"] | None = None
     """Wrong matches that `solve_graduated` found, which count in no cost; None of other solves."""
 
+    @functools.cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What was measured and does not fit: a line for each kind of residuals, besides pixels without a stated
+        accuracy, that fails a test of its standard deviations (solver/fit.py), with the names of its largest rows.
+        Computed when it is first asked for."""
+        from jaxba.solver.notes import notes_of
+
+        return notes_of(self.problem, self._counted) if self.iterations else ()
+
     @property
     def num_residuals(self) -> int:
         """Number of residuals: two of each observation, and those of other residuals' rows."""
         own = sum(len(rows) * rows.size for rows in self.problem.residuals.rows)
+        return 2 * int(np.sum(self._counted)) + own
+
+    @property
+    def _counted(self) -> Bool[np.ndarray, " observations"]:
+        """Which observations count in the cost."""
         away = np.isin(self.problem.camera_index, self.set_aside)
-        away |= False if self.rejected is None else self.rejected
-        return 2 * int(np.sum(~away)) + own
+        return ~(away if self.rejected is None else away | self.rejected)
 
     @property
     def num_parameters(self) -> int:
