@@ -20,6 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.hold import every_lens
 from jaxba.problem.labels import Part
+from jaxba.problem.row_data import is_unit
 
 MEASURED = {
     "control_points": "positions: {id: [x, y, z]}, or file, check, pixels, crs and align; stddev, loss and loss_scale",
@@ -69,6 +70,11 @@ def with_measured(
     else:
         from scipy.spatial.transform import Rotation  # imported late, as in geometry.py
 
+        for k, turn in zip(kept, columns["rotation"], strict=True):
+            if len(turn) == 4 and not is_unit(turn[None]).all():
+                pair = ", ".join(items[k])
+                written = ", ".join(f"{number:g}" for number in turn)
+                raise ValueError(f"{pair}: rotation: must be a quaternion of length one, not [{written}]")
         read = lambda x: Rotation.from_quat(np.roll(x, -1)) if len(x) == 4 else Rotation.from_rotvec(x)
         rotation = np.stack([read(x).as_matrix() for x in columns["rotation"]])
         whitening = np.eye(6) / np.repeat(stddev, 3, axis=1)[:, None]

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxba.problem.checks import SHOWN
 from jaxba.problem.losses import Loss
+from jaxba.problem.row_data import is_positive
 
 NAMED = 3  # names that a message gives of a longer list
 
@@ -83,7 +84,7 @@ def parse_pairs(
         for name, allowed in shapes.items():
             what = " or ".join(f"{shape[0]} numbers" if shape else "a number" for shape in allowed)
             columns[name].append(parse_numbers(f"{', '.join(pairs[-1])}: {name}", item[name], what, *allowed))
-            if name in ("stddev", "length") and not (columns[name][-1] > 0).all():
+            if name in ("stddev", "length") and not is_positive(columns[name][-1][None]).all():
                 raise ValueError(f"{', '.join(pairs[-1])}: {name}: must be positive, not {_written(item[name])}")
     return pairs, columns
 
@@ -123,7 +124,7 @@ def parse_stddev(value: dict[str, Any], images: list[str], kind: str) -> Float[n
 
 def parse_deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:
     numbers = parse_numbers(where, value, "a positive number, or three", (), (3,))
-    if not (numbers > 0).all():
+    if not is_positive(numbers[None]).all():
         raise ValueError(f"{where}: must be a positive number, or three, not {_written(value)}")
     return np.broadcast_to(numbers, 3)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -20,9 +21,11 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
 from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.labels import Labels, Part, part_name
 from jaxba.problem.losses import Loss
 from jaxba.problem.preprocess import far_middle, middle_and_extent, shift
 from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residual, Residuals, Rows, with_rows
+from jaxba.problem.row_data import other_length
 from jaxba.runtime.compilation import program
 from jaxba.runtime.numerics import numerics
 from jaxba.structure.agreement import ALONE
@@ -58,8 +61,9 @@ def with_residual(
     counts = {POSE: problem.num_cameras, LENS: lenses, POINT: problem.num_points}
     rows = replace(rows, loss=loss or Loss(), size=1)
     found = with_rows(problem.residuals, rows, dict(unknowns or {}), counts)
+    _check_values(problem.labels, found.rows[-1])
     size, known = _checked(problem, found)
-    rows = replace(found.rows[-1], size=size, residual=known)
+    rows = replace(found.rows[-1], size=size, residual=known, whole=())
     return problem.replace(residuals=replace(found, rows=(*found.rows[:-1], rows)))
 
 
@@ -105,13 +109,12 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residua
         problem = shift(problem, -far_middle(problem))  # rounding and steps are those of a solve
         (*_, kind), of, at = _rows_of(problem)
         try:
-            values = lambda *given: model.values(*given)  # a new function: an earlier trace may have had other globals
-            with _checked_indices():
-                traced, result = jax.make_jaxpr(values, return_shape=True)(kind, of, *at)
-            shape = result.shape[::-1]
+            traced, shape = _traced(kind, of, at)
         except Exception as error:
+            _check_lengths(kind, of, at, math.inf)
             text = " ".join(str(error).split())
             raise ValueError(f"residual {name} cannot be computed: {shown(text, 200)}") from error
+        _check_lengths(kind, of, at, float(math.prod(shape[1:])))
         if len(shape) != 2 or not shape[1]:
             raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[:0:-1]}")
         if len(kind.points) > 1 and shape[1] > POSE_SIZE:  # of the camera that splits it
@@ -127,6 +130,58 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residua
         _check_dependence(kind, of, *derivatives)
         check_derivatives(kind, of, jax.device_get(at), middle_and_extent(problem)[1] or 1.0)
     return shape[1], known
+
+
+def _check_values(labels: Labels | None, rows: Rows) -> None:
+    """Raises a ValueError that names a row whose data cannot be what they are of a ready-made residual."""
+    kinds = dict(rows.residual.kinds)
+    for name, values in zip(rows.residual.data, rows.data, strict=True):
+        if name in kinds and (wrong := kinds[name].wrong(np.asarray(values))):
+            what = f"{name} of {rows.residual.name}"
+            value = shown(np.asarray(values)[wrong[0]].tolist())
+            where = _row_name(labels, rows, wrong[0])
+            raise ValueError(f"{what} must be {kinds[name].what}, not {value} ({where})")
+
+
+def _row_name(labels: Labels | None, rows: Rows, row: int) -> str:
+    """A row by the names of its images and points; by its position if it has none."""
+    parts: dict[str, Part] = {POSE: "image", POINT: "point"}
+    pairs = zip(rows.residual.unknowns, rows.index, strict=True)
+    kinds = [(parts.get(name.removesuffix(SECOND)), index[row]) for name, index in pairs]
+    names = [part_name(labels, kind, at) for kind, at in kinds if kind]
+    return ", ".join(names) or f"row {row}"
+
+
+def _traced(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any]) -> tuple[Any, tuple[int, ...]]:
+    """What a residual computes, and the shape of its values, rows first."""
+
+    def values(*given: Any) -> jax.Array:  # a new function: an earlier trace may have had other globals
+        return model.values(*given)
+
+    with _checked_indices():
+        traced, result = jax.make_jaxpr(values, return_shape=True)(kind, unknowns, *at)
+    return traced, result.shape[::-1]
+
+
+def _check_lengths(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any], size: float) -> None:
+    """Raises a ValueError for an array of another length that counts, whole, for each row, where rows have fewer
+    numbers than `size` with one of its entries: it was meant to have an entry for each row."""
+    names, data = kind.rows.residual.data, kind.rows.data
+    for name in kind.rows.whole:
+        k = names.index(name)
+        rows = replace(kind.rows, data=(*data[:k], data[k][:, 0], *data[k + 1 :]))
+        if _size(replace(kind, rows=rows), unknowns, at) < size:
+            what = f"{name} of {kind.rows.residual.name}"
+            raise ValueError(other_length(what, data[k].shape[1], len(kind.rows)))
+
+
+def _size(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any]) -> float:
+    """How many numbers a row of a residual has; infinite if it cannot be computed, or is no number or vector."""
+    try:
+        _, shape = _traced(kind, unknowns, at)
+    except Exception:
+        return math.inf
+    return float(math.prod(shape[1:])) if len(shape) <= 2 else math.inf
 
 
 @contextlib.contextmanager

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.checks import indices, plain_array, real_numbers, shown
 from jaxba.problem.losses import Loss
+from jaxba.problem.row_data import Datum
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 POSE, LENS, POINT, PIXELS = "pose", "lens", "point", "pixels"
@@ -42,6 +43,9 @@ class Residual:
     data: tuple[str, ...]
     """Names of its keyword-only parameters."""
 
+    kinds: tuple[tuple[str, Datum], ...] = ()
+    """What data may be, by keyword, as far as it is known (`with_data`)."""
+
     source: str = ""
     """What determines the computations of the function once it is registered, a digest; empty if nothing does."""
 
@@ -58,28 +62,48 @@ class Residual:
         return _imported, (self.function.__module__, self.function.__qualname__, self.source)
 
     def __call__(self, **columns: Any) -> Rows:
-        """Rows of the residual. Each unknown gets an index or a vector of them: a camera for `pose`, a point for
-        `point`, a lens (a camera in a problem without shared lenses) for `lens`, a row for a block. Each keyword of
-        data gets an array with a row for each residual, or one value for all, with a first axis of one if its own first
-        axis is as long as there are residuals. Raises ValueError: a name is missing or unknown, lengths differ, or
-        something is no index or no number; one line."""
+        """Rows of the residual.
+
+        Args:
+            columns: for each unknown an index or a vector of them: a camera for `pose`, a point for `point`, a lens (a
+                camera in a problem without shared lenses) for `lens`, a row for a block. For each keyword of data one
+                value for all rows, which is a number or has a first axis of one, or an array whose first axis is as
+                long as there are rows. Ready-made residuals know whether a value is a number, a vector or a matrix, and
+                take that as one value, too. Any other array counts, whole, for each row, as a vector `up` does, and
+                `with_residual` refuses it if rows have fewer numbers with one of its entries.
+
+        Raises:
+            ValueError: a name is missing or unknown, lengths differ, or something is no index or no number; one line.
+        """
         names = (*self.unknowns, *self.data)
-        for what, found in (("has no", columns.keys() - set(names)), ("needs", set(names) - columns.keys())):
-            if found:
-                raise ValueError(f"residual {self.name} {what} {min(found)}; its parameters: {', '.join(names)}")
+        for what, names_wrong in (
+            ("has no", columns.keys() - set(names)),
+            ("needs", set(names) - columns.keys()),
+        ):
+            if names_wrong:
+                parameters = ", ".join(names)
+                raise ValueError(f"residual {self.name} {what} {min(names_wrong)}; its parameters: {parameters}")
         given = [np.atleast_1d(plain_array(f"{x} of {self.name}", columns[x])) for x in self.unknowns]
         count = max(map(len, given))
-        index, data = [np.broadcast_to(one, count) if one.shape == (1,) else one for one in given], []
-        for x, one in zip(self.unknowns, index, strict=True):
-            if one.shape != (count,) or (count and one.dtype.kind not in "iu"):
+        index = [np.broadcast_to(column, count) if column.shape == (1,) else column for column in given]
+        for x, column in zip(self.unknowns, index, strict=True):
+            if column.shape != (count,) or (count and column.dtype.kind not in "iu"):
                 raise ValueError(f"{x} of {self.name} must be a vector of {count} integers, not {shown(columns[x])}")
+        kinds = dict(self.kinds)
+        data = []
+        whole = []
         for x in self.data:
             value = real_numbers(f"{x} of {self.name}", columns[x])
             if not np.isfinite(value).all():
                 raise ValueError(f"{x} of {self.name} must be finite")
-            own = value.shape[1:] if value.shape[:1] in ((1,), (count,)) else value.shape
-            data.append(np.broadcast_to(value, (count, *own)))
-        return Rows(tuple(index), tuple(data), residual=self)
+            if x in kinds:
+                data.append(kinds[x].rows_of(f"{x} of {self.name}", value, count))
+            elif value.shape[:1] in ((), (1,), (count,)):
+                data.append(np.broadcast_to(value, (count, *value.shape[1:])))
+            else:
+                data.append(np.broadcast_to(value, (count, *value.shape)))
+                whole.append(x)
+        return Rows(tuple(index), tuple(data), residual=self, whole=tuple(whole))
 
 
 def _imported(module: str, name: str, source: str) -> Residual:
@@ -102,6 +126,16 @@ def residual(function: Callable[..., Any]) -> Residual:
     if not unknowns:
         raise ValueError(f"residual {function.__name__} has no unknown: its positional parameters are unknowns")
     return Residual(function, unknowns, data)
+
+
+def with_data(**kinds: Datum) -> Callable[[Residual], Residual]:
+    """A decorator of a residual: what its data may be, by keyword."""
+
+    def known(given: Residual) -> Residual:
+        assert set(kinds) == set(given.data), f"{given} has the data {given.data}"
+        return replace(given, kinds=tuple(kinds.items()))
+
+    return known
 
 
 @register_pytree
@@ -133,6 +167,9 @@ class Rows(ArrayRecord):
 
     size: int = field(default=0, metadata={"static": True}, kw_only=True)
     """Numbers that the function returns; 0 before it is registered."""
+
+    whole: tuple[str, ...] = field(default=(), metadata={"static": True}, kw_only=True)
+    """Keywords whose array counts, whole, for each row; none once it is registered."""
 
     def __len__(self) -> int:
         return len(self.index[0])

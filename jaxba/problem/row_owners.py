@@ -74,7 +74,10 @@ def owners_of(problem: BundleProblem, rows: Rows, groups: list[Int[np.ndarray, "
                 holds = group[:, None] == index
                 camera = np.where((camera < 0) & holds.any(axis=0), holds.argmax(axis=0), camera)
         if (camera < 0).any():
-            raise ProblemError(f"residual {rows.residual.name}: no residual says which cameras have its unknowns")
+            raise ProblemError(
+                f"residual {rows.residual.name}: no residual says which cameras have its unknowns; put all of them in "
+                f"one block with a row for each of {problem.num_cameras} cameras"
+            )
         cameras.append(camera)
     points = sum(name.removesuffix(SECOND) == POINT for name in names)
     if len(cameras) * points > 1:

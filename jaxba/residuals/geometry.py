@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from jaxba.problem.residuals import residual
+from jaxba.problem.residuals import residual, with_data
+from jaxba.problem.row_data import (
+    DIRECTION,
+    NUMBER,
+    POSITIVE,
+    UNIT_VECTOR,
+    VECTOR,
+    deviations,
+    whitenings,
+)
 from jaxba.problem.row_value import times
 from jaxba.problem.safe_math import safe_sqrt
 
 
+@with_data(position=VECTOR, whitening=whitenings(3))
 @residual
 def control_point(point, *, position, whitening):
     """A surveyed point: its difference from `position` (3), whitened by a matrix (3, 3) (three numbers)."""
     return times(whitening, point - position)
 
 
+@with_data(length=POSITIVE, sigma=POSITIVE)
 @residual
 def distance(point, point_2, *, length, sigma):
     """A scale bar: the distance between two points less `length`, over `sigma` (one number)."""
     return (safe_sqrt(jnp.sum((point_2 - point) ** 2)) - length) / sigma
 
 
+@with_data(normal=UNIT_VECTOR, on_plane=VECTOR, sigma=POSITIVE)
 @residual
 def point_to_plane(point, *, normal, on_plane, sigma):
     """A surface that a LiDAR has measured: the distance of a point from the plane through `on_plane` (3) with a unit
@@ -28,12 +40,14 @@ def point_to_plane(point, *, normal, on_plane, sigma):
     return normal @ (point - on_plane) / sigma
 
 
+@with_data(length=POSITIVE, sigma=POSITIVE)
 @residual
 def baseline(pose, pose_2, *, length, sigma):
     """The distance between the centres of two cameras less `length`, over `sigma` (one number)."""
     return (safe_sqrt(jnp.sum((pose_2.center - pose.center) ** 2)) - length) / sigma
 
 
+@with_data(direction=DIRECTION, up=DIRECTION, sigma=deviations(3))
 @residual
 def gravity(pose, *, direction, up, sigma):
     """What an accelerometer at rest measures, which is up: `direction` (3, in the camera's frame) against `up` (3, in
@@ -42,6 +56,7 @@ def gravity(pose, *, direction, up, sigma):
     return (times(pose.rotation, up) / jnp.sqrt(up @ up) - direction / jnp.sqrt(direction @ direction)) / sigma
 
 
+@with_data(azimuth=NUMBER, north=DIRECTION, up=DIRECTION, sigma=POSITIVE)
 @residual
 def heading(pose, *, azimuth, north, up, sigma):
     """What a compass measures: the azimuth of the optical axis, clockwise from `north` (3) about `up` (3) seen from
@@ -54,6 +69,7 @@ def heading(pose, *, azimuth, north, up, sigma):
     return jnp.arctan2(y * cos - x * sin, x * cos + y * sin) / sigma
 
 
+@with_data(position=VECTOR, lever_arm=VECTOR, whitening=whitenings(3))
 @residual
 def position(pose, *, position, lever_arm, whitening):
     """A GNSS antenna at `lever_arm` (3) in the camera's frame, at `position` (3) in the world, whitened (3, 3)."""

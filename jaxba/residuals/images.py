@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from jaxba.problem.residuals import residual
+from jaxba.problem.residuals import residual, with_data
+from jaxba.problem.row_data import ANY, NUMBER, POSITIVE, deviations, vectors
 from jaxba.rotations import rotation_matrix
 
 
+@with_data(measured=NUMBER, sigma=POSITIVE)
 @residual
 def depth(pose, point, image, *, measured, sigma):
     """A depth map at the pixel of a point: `scale z + shift - measured` over `sigma` (one number), with scale and shift
@@ -15,6 +17,7 @@ def depth(pose, point, image, *, measured, sigma):
     return (image[0] * pose.to_camera(point)[2] + image[1] - measured) / sigma
 
 
+@with_data(pixel=vectors(2), time=NUMBER, sigma=deviations(2))
 @residual
 def rolling_shutter(pose, lens, point, velocity, *, pixel, time, sigma):
     """The pixel of a point `time` (seconds) after the moment of the pose, less `pixel` (2, as
@@ -27,6 +30,7 @@ def rolling_shutter(pose, lens, point, velocity, *, pixel, time, sigma):
     return (lens.project(turn @ pose.to_camera(point - time * velocity[3:])) - pixel) / sigma
 
 
+@with_data(low=vectors(ANY), high=vectors(ANY), sigma=deviations(ANY))
 @residual
 def lens_bounds(lens, *, low, high, sigma):
     """A soft barrier at bounds of the numbers of a lens, in the order of its camera model: of the excess d over `sigma`

@@ -15,13 +15,23 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.problem.checks import finite
-from jaxba.problem.residuals import residual
+from jaxba.problem.residuals import residual, with_data
+from jaxba.problem.row_data import (
+    MOUNT,
+    POSITIVE,
+    ROTATION,
+    VECTOR,
+    matrices,
+    vectors,
+    whitenings,
+)
 from jaxba.problem.row_value import times
 from jaxba.rotations import angle_axis, left_jacobian_inverse, rotation_matrix
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 
 
+@with_data(rotation=ROTATION, translation=VECTOR, whitening=whitenings(6))
 @residual
 def relative_pose(pose, pose_2, *, rotation, translation, whitening):
     """Odometry or a loop closure: the pose of the second camera in the frame of the first, `P_1 = rotation P_2 +
@@ -37,6 +47,17 @@ def relative_pose(pose, pose_2, *, rotation, translation, whitening):
     return times(whitening, jnp.concatenate([turn, left_jacobian_inverse(turn[:, None])[..., 0] @ shift]))
 
 
+@with_data(
+    rotation=ROTATION,
+    velocity=VECTOR,
+    position=VECTOR,
+    by_bias=matrices(9, 6),
+    bias=vectors(6),
+    duration=POSITIVE,
+    whitening=whitenings(15),
+    gravity=VECTOR,
+    mount=MOUNT,
+)
 @residual
 def imu(
     pose, motion, pose_2, motion_2, *, rotation, velocity, position, by_bias, bias, duration, whitening, gravity, mount

@@ -185,7 +185,19 @@ def test_depth_maps_are_looked_up_from_the_principal_points_of_a_model(problem, 
         ),
         (
             "relative_poses: [{images: [1, 2], rotation: [0, 0, 0, 0], translation: [0, 0, 0], stddev: [1, 1]}]",
-            "relative_poses: Found zero norm quaternions",
+            "relative_poses: 1, 2: rotation: must be a quaternion of length one, not [0, 0, 0, 0]",
+        ),
+        (
+            "relative_poses: [{images: [1, 2], rotation: [1, 1, 0, 0], translation: [0, 0, 0], stddev: [1, 1]}]",
+            "relative_poses: 1, 2: rotation: must be a quaternion of length one, not [1, 1, 0, 0]",
+        ),
+        (
+            "gravity: {up: [0, 0, 1], directions: {1: [0, 1, 0], view1.jpg: [0, 0, 0]}}",
+            "gravity: direction of gravity must be other than zero, not [0.0, 0.0, 0.0] (image 2 (view1.jpg))",
+        ),
+        (
+            "gravity: {up: [0, 0, 0], directions: {1: [0, 1, 0]}}",
+            "gravity: up of gravity must be other than zero, not [0.0, 0.0, 0.0]",
         ),
         ("depths: {folder: nowhere}", "depths: 'stddev' is missing"),
         ("depths: {folder: ., stddev: -1}", "depths: stddev: must be a positive number, or three, not -1"),

@@ -188,17 +188,3 @@ def test_bounds_of_lenses_are_a_smooth_hinge_that_acts_everywhere():
     problem = scene()  # far inside, where a hinge that is zero would be refused
     rows = residuals.lens_bounds(lens=np.arange(5), low=low[None] - 1e3, high=high[None] + 1e3, sigma=0.01)
     assert len(jaxba.with_residual(problem, rows).residuals.rows[0]) == 5
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        lambda: residuals.control_point(point=[0, 1, 2], position=np.zeros((3, 3)), whitening=np.eye(3)),
-        lambda: residuals.gravity(pose=[0, 1, 2], direction=np.eye(3), up=UP, sigma=0.1),
-        lambda: residuals.lens_bounds(lens=[0, 1, 2], low=np.zeros(3), high=np.ones(3), sigma=0.1),
-    ],
-)
-def test_one_value_for_all_is_no_row_of_numbers(rows):
-    """As many rows as a vector or a matrix for all is long: a first axis of one is needed, and missed at once."""
-    with pytest.raises(ValueError, match="cannot be computed"):
-        jaxba.with_residual(scene(), rows())

@@ -225,3 +225,48 @@ def test_all_solvers_and_refinements_find_the_same_minimum(policy, linear_solver
         truth = jaxba.solve(problem, "ceres").final_cost
         options = jaxba.SolveOptions(linear_solver=linear_solver)
         assert jaxba.solve(problem, policy, options).final_cost == pytest.approx(truth, rel=1e-4)
+
+
+@jaxba.residual
+def planar(state, state_2, *, bearing, distance):
+    seen = turned(state, state_2)
+    return 10 * jnp.stack([jnp.arctan2(seen[1], seen[0]) - bearing, jnp.sqrt(seen @ seen) - distance])
+
+
+@jaxba.residual
+def odometry(state, state_2, *, move):
+    return 5 * (jnp.concatenate([turned(state, state_2), (state_2[2] - state[2])[None]]) - move)
+
+
+@jaxba.residual
+def start(state):
+    return 5 * state
+
+
+def turned(state, state_2):
+    cos, sin = jnp.cos(state[2]), jnp.sin(state[2])
+    return jnp.array([[cos, sin], [-sin, cos]]) @ (state_2[:2] - state[:2])
+
+
+def test_unknowns_of_ones_own_alone_say_that_they_have_to_be_of_one_block():
+    cameras = np.tile([0.0] * 6 + [1.0, 0.0, 0.0], (5, 1))
+    rows = odometry(state=[0, 1], state_2=[1, 2], move=[2.0, 0.0, 0.0])
+    with pytest.raises(jaxba.ProblemError, match=r"no residual says which .* a row for each of 5 cameras"):
+        jaxba.with_residual(jaxba.BundleProblem.create(cameras), rows, unknowns={"state": np.zeros((3, 3))})
+
+
+@pytest.mark.slow
+def test_a_robot_in_the_plane_is_one_block_of_states_and_landmarks():
+    """GTSAM's PlanarSLAMExample, without noise: three states, then two landmarks."""
+    cameras = np.tile([0.0] * 6 + [1.0, 0.0, 0.0], (5, 1))
+    problem = jaxba.hold(jaxba.BundleProblem.create(cameras), poses="all")
+    truth = np.array([[0, 0, 0], [2, 0, 0], [4, 0, 0], [2, 2, 0], [4, 2, 0.0]])
+    off = truth + np.array([[-0.2, 0.2, 0.1], [0.3, 0.1, -0.2], [0.1, 0.1, 0.1], [-0.2, 0.1, 0], [0.1, -0.2, 0]])
+    rows = odometry(state=[0, 1], state_2=[1, 2], move=[2.0, 0.0, 0.0])
+    problem = jaxba.with_residual(problem, rows, unknowns={"state": off})
+    problem = jaxba.with_residual(problem, start(state=0))
+    bearing, length = np.radians([45.0, 90.0, 90.0]), [np.sqrt(8), 2.0, 2.0]
+    rows = planar(state=[0, 1, 2], state_2=[3, 3, 4], bearing=bearing, distance=length)
+    solution = jaxba.solve(jaxba.with_residual(problem, rows), "ceres")
+    assert solution.final_cost < 1e-20
+    np.testing.assert_allclose(solution.problem.residuals.blocks[0], truth, atol=1e-9)

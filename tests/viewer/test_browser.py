@@ -324,7 +324,7 @@ def test_residuals_are_segments_of_a_colour_for_each_and_their_worst_rows_are_li
     from jaxba.viewer.words import about_rows
 
     problem = recording.problem
-    bars = residuals.distance(point=[0, 1, 2], point_2=[3, 4, 5], length=[0.0, 50.0, 0.0], sigma=0.1)
+    bars = residuals.distance(point=[0, 1, 2], point_2=[3, 4, 5], length=[1e-3, 50.0, 1e-3], sigma=0.1)
     problem = jaxba.with_residual(problem, bars)
     ahead = residuals.baseline(pose=[0, 1], pose_2=[1, 2], length=1.0, sigma=0.1)
     problem = jaxba.with_residual(problem, ahead)
