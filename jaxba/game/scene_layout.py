@@ -39,4 +39,4 @@ def with_scene(layout: Layout, pixels: Float[AnyArray, "2 slots"], mask: Bool[An
     """The layout of the class with one scene's observations."""
     cameras = layout.num_cameras
     seen = jnp.any(mask.reshape(cameras, -1), axis=1)
-    return replace(layout, pixels=pixels, slot_mask=mask, camera_seen=seen)
+    return replace(layout, pixels=pixels, slot_mask=mask, slot_used=mask, camera_seen=seen)

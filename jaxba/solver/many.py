@@ -239,7 +239,8 @@ class _Many:
                     job.result.set_result(error)
                     continue
                 leaves, tree = jax.tree.flatten(setup.layout)
-                groups.setdefault((setup.options, tree, *(x.shape for x in leaves)), []).append((setup, job))
+                shapes = [(x.shape, x.dtype) for x in leaves]
+                groups.setdefault((setup.options, tree, *shapes), []).append((setup, job))
             for key, group in groups.items():
                 if len(group) < len(bank) / 4 and key not in self._programs:  # of unusual shape
                     self._begin([job for _, job in group], self._solve_alone)

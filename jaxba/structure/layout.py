@@ -53,6 +53,7 @@ class Layout(ArrayRecord):
     slot_camera: Int[AnyArray, " slots"]  # camera of each slot
     slot_point: Int[AnyArray, " slots"]  # point of each slot, in layout order
     slot_mask: Bool[AnyArray, " slots"]  # whether the slot holds an observation with pixels
+    slot_used: Bool[AnyArray, " slots"]  # whether it holds any, also one that stands for a row of a residual
     observation: Int[AnyArray, " slots"]  # index in the problem of the observation of each slot; out of range if empty
     pixels: Float[AnyArray, "2 slots"]  # measured pixels; zero in empty slots
     whitening: Float[AnyArray, "2 2 slots"] | None  # `Sigma^(-1/2)` of each observation
@@ -184,6 +185,7 @@ def build_layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slots.point,
         slot_mask=in_slots(~stands_for_rows(problem)[order]),
+        slot_used=in_slots(np.ones(len(order), bool)),
         observation=in_slots(order.astype(np.int32), len(order)),
         pixels=in_order(problem.observations),
         whitening=None if problem.whitening is None else in_order(problem.whitening),

@@ -137,7 +137,7 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
     """Sums over the slots of each point: a dense sum per bucket, or over chunks and then ranks in a padded layout."""
     if layout.point_levels is not None:
         # points read an empty chunk, of which a nan would spread to all of them
-        seen = jnp.where(layout.slot_mask, values, jnp.zeros_like(values))
+        seen = jnp.where(layout.slot_used, values, jnp.zeros_like(values))
         count = layout.num_slots // POINT_CHUNK
         chunks = functools.reduce(operator.add, [seen[:, k * count : (k + 1) * count] for k in range(POINT_CHUNK)])
         return _sum_of_chunks(layout, layout.point_levels, chunks)
@@ -180,7 +180,7 @@ def point_sums_of(
         return [functools.reduce(operator.add, rows) for rows in zip(*terms, strict=True)]
 
     halves = [
-        jax.tree.map(lambda x, k=k: x.reshape(*x.shape[:-1], POINT_CHUNK, -1)[..., k, :], (layout.slot_mask, *operands))
+        jax.tree.map(lambda x, k=k: x.reshape(*x.shape[:-1], POINT_CHUNK, -1)[..., k, :], (layout.slot_used, *operands))
         for k in range(POINT_CHUNK)
     ]
     return list(_sum_of_chunks(layout, layout.point_levels, jnp.stack(compute_in_one_loop(summed, *halves))))

@@ -111,15 +111,8 @@ def in_pairs(problem):
     return problem.replace(rigs=Rigs(frame, rotation, translation))
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param("shared lens", marks=pytest.mark.slow),
-        "constants",
-        pytest.param("priors", marks=pytest.mark.slow),
-        pytest.param("rigs", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow  # a fast one, with constants: test_every_way.py
+@pytest.mark.parametrize("kind", ["shared lens", "constants", "priors", "rigs"])
 def test_what_a_problem_may_hold_it_may_hold_among_many(small, kind):
     problems, options = general()[kind], replace(QUICK, loss=Loss("huber", 1.0))
     found = list(solve_many(problems, "ceres", options))
