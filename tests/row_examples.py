@@ -85,7 +85,7 @@ def point_to_plane(problem: BundleProblem, rng: np.random.Generator) -> Example:
     normal = rng.standard_normal((4, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     on_plane = near(rng, problem.points[points], 0.3)
-    return Example(residuals.point_to_plane(point=points, normal=normal, on_plane=on_plane, sigma=[[0.1]]), 1)
+    return Example(residuals.point_to_plane(point=points, normal=normal, on_plane=on_plane, sigma=0.1), 1)
 
 
 def baseline(problem: BundleProblem, rng: np.random.Generator) -> Example:
