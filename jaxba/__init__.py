@@ -71,7 +71,11 @@ if TYPE_CHECKING:
     from jaxba.constraints.file import survey
     from jaxba.io.reconstruction import from_pycolmap
     from jaxba.results.alternation import solve_and_retriangulate
-    from jaxba.results.bundle_adjustment import bundle_adjustment
+    from jaxba.results.bundle_adjustment import (
+        bundle_adjustment,
+        create_default_bundle_adjuster,
+        create_pose_prior_bundle_adjuster,
+    )
     from jaxba.results.covariance import Covariance, covariance
     from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
     from jaxba.results.graduated import solve_graduated
@@ -90,7 +94,11 @@ _LATE = {
     "results.alternation": ("solve_and_retriangulate",),
     "constraints.file": ("survey",),
     "io.reconstruction": ("from_pycolmap",),
-    "results.bundle_adjustment": ("bundle_adjustment",),
+    "results.bundle_adjustment": (
+        "bundle_adjustment",
+        "create_default_bundle_adjuster",
+        "create_pose_prior_bundle_adjuster",
+    ),
     "results.covariance": ("Covariance", "covariance"),
     "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
     "results.graduated": ("solve_graduated",),
@@ -154,6 +162,8 @@ __all__ = [
     "build_layout",
     "bundle_adjustment",
     "covariance",
+    "create_default_bundle_adjuster",
+    "create_pose_prior_bundle_adjuster",
     "differentiable_solve",
     "example_problem",
     "from_pycolmap",

@@ -42,6 +42,7 @@ class Termination(enum.IntEnum):
     ROUNDING = 9
     NO_WEIGHT = 10
     WITHIN = 11
+    NOTHING = 12
 
     @property
     def converged(self) -> bool:
@@ -67,6 +68,7 @@ _REASONS = {
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
     Termination.WITHIN: "estimated as near to the end as asked for",
+    Termination.NOTHING: "nothing is observed, so that nothing was solved",
     Termination.TARGET: "cost at or below the target",
     Termination.DAMPING_LIMIT: "lambda at its upper limit, or not a number, and still rejected",
 }

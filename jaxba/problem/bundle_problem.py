@@ -30,6 +30,10 @@ class ProblemError(InputError):
     """The input is not a valid bundle adjustment problem. The message is one line for the user."""
 
 
+class NothingObserved(ProblemError):
+    """No observation is left that could be solved. The message is one line for the user."""
+
+
 class ProblemWarning(UserWarning):
     """A part of the input was left out, was mended, or looks wrong. The message is one line for the user."""
 

@@ -36,22 +36,39 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     Raises ValueError: no such gauge. Raises ProblemError: too few points are observed. Source: COLMAP,
     `FixGaugeWithTwoCamsFromWorld`, `FixGaugeWithThreePoints`."""
     check_known("gauge", gauge, Gauge)
+    gauged = fixed_gauge(problem, gauge)
+    if gauged is problem and gauge != "free":
+        fixed = "constants and priors fix position, orientation and scale already"
+        warnings.warn(f"the gauge {gauge} is not needed: {fixed}", ProblemWarning, stacklevel=2)
+    return gauged
+
+
+def fixed_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
+    """`with_gauge`, silent where nothing is left to fix: then the problem itself comes back."""
     if gauge == "free":
         return problem
-    note = functools.partial(warnings.warn, category=ProblemWarning, stacklevel=2)
+    note = functools.partial(warnings.warn, category=ProblemWarning, stacklevel=3)
     directions, steps, *_ = freedoms(shift(problem, -far_middle(problem)))
-    free, found = directions.shape[1], None
+    free = directions.shape[1]
     if not free:
-        note(f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already")
         return problem
-    if gauge == "two-cameras" and (found := _two_cameras(problem, steps[:, :POSE_SIZE] @ directions)) is None:
-        note("two cameras cannot fix position, orientation and scale: the gauge holds three points")
-    usual, found = (free + 2, _three_points(problem)) if found is None else (free, found)
-    numbers = lambda constants: 0 if constants is None else int(constants.poses.sum() + 3 * constants.points.sum())
-    if (held := numbers(found) - numbers(problem.constants)) > usual:
+    usual = free
+    found = _two_cameras(problem, steps[:, :POSE_SIZE] @ directions) if gauge == "two-cameras" else None
+    if found is None:
+        if gauge == "two-cameras":
+            note("two cameras cannot fix position, orientation and scale: the gauge holds three points")
+        usual = free + 2
+        found = _three_points(problem)
+    held = _held_numbers(found) - _held_numbers(problem.constants)
+    if held > usual:
         known = f"{SIMILARITY - free} of {SIMILARITY} directions of the scene are fixed already"
         note(f"{known}: the gauge holds more than is free, {held} numbers; hold poses or points instead")
     return problem.replace(constants=found)
+
+
+def _held_numbers(constants: Constants | None) -> int:
+    """How many numbers of poses and points are constant."""
+    return 0 if constants is None else int(constants.poses.sum() + 3 * constants.points.sum())
 
 
 def _two_cameras(problem: BundleProblem, steps: Float[np.ndarray, "cameras 6 directions"]) -> Constants | None:

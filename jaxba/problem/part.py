@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, NothingObserved
 from jaxba.problem.hold import Which, every_lens, hold, mask_of
 from jaxba.problem.preprocess import observed
 
@@ -39,14 +39,14 @@ def part(
         ignored: points that do not count.
         min_track: fewest observations of a point, in all of the problem, with which it counts.
 
-    Raises ValueError: no such image or point. Raises ProblemError: nothing is left."""
+    Raises ValueError: no such image or point. Raises NothingObserved, a ProblemError: nothing is left."""
     camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     mine = mask_of(problem, images, problem.num_cameras, "image")
     whole, dropped = (mask_of(problem, which, problem.num_points, "point") for which in (points, ignored))
     tracks = np.bincount(point, minlength=problem.num_points)
     counts = (mine[camera] | whole[point]) & ~dropped[point] & (tracks >= min_track)[point]
     if not counts.any():
-        raise ProblemError("no observation is left of this part of the problem")
+        raise NothingObserved("no observation is left of this part of the problem")
     left = np.bincount(point[counts], minlength=problem.num_points)
     lenses = every_lens(problem)
     used = np.bincount(np.asarray(lenses.index)[mine], minlength=len(lenses.free)) > 0

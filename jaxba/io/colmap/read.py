@@ -18,7 +18,7 @@ from jaxba.io.colmap.observations import Ordered, Views, find_views, ordered
 from jaxba.io.colmap.poses import Pose, bal_poses, composed, differ, rotations, translations
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.notes import counted, report
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, NothingObserved, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.labels import Labels
 from jaxba.problem.rigs import Rigs
@@ -95,7 +95,7 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     views, odd = _finite(table, views)
     notes += found + odd
     if not views.size:
-        raise ProblemError("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
+        raise NothingObserved("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
     sees = np.bincount(views[0], minlength=len(images)) > 0
     observed = np.bincount(views[2], minlength=len(table.points)) > 0
     unseen = np.flatnonzero(~observed & np.isfinite(table.points["xyz"]).all(axis=1))
