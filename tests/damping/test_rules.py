@@ -19,10 +19,10 @@ from jaxba.typing import InputError
 count = lambda n: jnp.asarray(n, jnp.int32)
 
 
-def info(unit: float = 1.0, dtype=jnp.float64) -> ProblemInfo:
+def info(unit: float = 1.0, dtype=jnp.float64, observations: int = 100) -> ProblemInfo:
     return ProblemInfo(
         cost=jnp.asarray(1.0, dtype),
-        observations=count(100),
+        observations=count(observations),
         cameras=count(4),
         points=count(30),
         unit=jnp.asarray(unit, dtype),
@@ -150,9 +150,9 @@ def test_gauss_newton_is_next_to_no_damping():
     assert lambdas(make_policy("gauss-newton"), [(True, 1.0), REJECTED]) == [1e-10] * 3
 
 
-def played(policy: DampingPolicy, *steps: dict) -> list[float]:
+def played(policy: DampingPolicy, *steps: dict, observations: int = 100) -> list[float]:
     """log10 of the first lambda, and of the one after each accepted step of full length with these changes."""
-    state, damping = policy.init(info())
+    state, damping = policy.init(info(observations=observations))
     found = [float(jnp.log10(damping))]
     for changes in steps:
         step = step_info(**{"accepted": True, "gain": 0.8, "damping": damping, **changes})
@@ -170,6 +170,12 @@ def test_guarded_is_at_its_least_lambda_after_the_first_step_and_half_a_decade_h
     np.testing.assert_allclose(above, [-5, *found[1:]], atol=1e-12)
     twice = played(make_policy("guarded"), shortened, shortened, rejected, full)
     np.testing.assert_allclose(twice, [-6, -5, -4, -3.5, -8], atol=1e-12)
+
+
+def test_guarded_goes_to_a_smaller_lambda_where_there_are_no_pixels():
+    rejected = {"accepted": False, "gain": -1.0}
+    chosen = played(make_policy("guarded"), {}, rejected, {}, observations=0)
+    np.testing.assert_allclose(chosen, [-6, -12, -11.5, -12], atol=1e-12)
 
 
 def test_guarded_gives_way_to_ceres_rule_after_two_rejections_in_a_row_or_eight_in_all():

@@ -123,6 +123,64 @@ def test_a_solve_finds_poses_velocities_and_biases():
     np.testing.assert_allclose(solution.problem.points, points, atol=1e-3)
 
 
+@jaxba.residual
+def known_motion(motion, *, value, sigma):
+    """Velocity and biases of a state that is known."""
+    return (motion - value) / sigma
+
+
+@pytest.mark.slow
+def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iterations():
+    """Exact samples of a body on a spiral, priors at both ends, and starts off by 0.1 radians and a metre, as in GTSAM's
+    ImuFactorExample, which takes 5 iterations."""
+    rng = np.random.default_rng(0)
+    seconds, rate = 12, 100
+    spin = np.radians([30.0, -30.0, 0.0])  # in the body's frame, as its velocity
+    speed = np.array([2.0, 0.0, 0.0])
+    t = np.arange(seconds * rate + 1) / rate
+    turns = Rotation.from_rotvec(np.outer(t, spin))
+    forces = np.cross(spin, speed) - turns.inv().apply(GRAVITY)
+    axis = spin / np.linalg.norm(spin)
+    angle = np.linalg.norm(spin) * t[:, None]
+    across = np.cross(axis, speed) / np.linalg.norm(spin)
+    along = axis * (axis @ speed)
+    places = along * t[:, None] + np.sin(angle) * (speed - along) / np.linalg.norm(spin) + (1 - np.cos(angle)) * across
+    states = np.arange(seconds + 1) * rate
+    ends = [0, seconds]
+
+    moved = turns[states] * Rotation.from_rotvec(0.1 * rng.standard_normal((len(states), 3)))
+    rotation = geometry.COLMAP_FLIP[:, None] * moved.inv().as_matrix()
+    centers = places[states] + rng.standard_normal((len(states), 3))
+    lens = np.tile([1.0, 0.0, 0.0], (len(states), 1))
+    cameras = np.hstack([geometry.angle_axis(rotation), geometry.translations(rotation, centers), lens])
+    velocities = turns[states].apply(speed)
+    motion = np.hstack([velocities + 0.1 * rng.standard_normal(velocities.shape), np.zeros((len(states), 6))])
+
+    given = residuals.preintegrated(t, np.tile(spin, (len(t), 1)), forces, t[states], noise=[1e-3] * 4)
+    first = np.arange(seconds)
+    rows = residuals.imu(
+        pose=first,
+        motion=first,
+        pose_2=first + 1,
+        motion_2=first + 1,
+        **given,
+        gravity=GRAVITY[None],
+        mount=np.eye(3, 4)[None],
+    )
+    problem = jaxba.with_residual(jaxba.BundleProblem.create(cameras), rows, unknowns={"motion": motion})
+    value = np.hstack([velocities[ends], np.zeros((2, 6))])
+    sigma = np.array([0.1] * 3 + [1e-3] * 6)[None]
+    problem = jaxba.with_residual(problem, known_motion(motion=ends, value=value, sigma=sigma))
+    problem = jaxba.with_position_priors(problem, places[states][ends], stddev=0.1, images=ends, align=False)
+    true = geometry.COLMAP_FLIP[:, None] * turns[states][ends].inv().as_matrix()
+    problem = jaxba.with_rotation_priors(problem, geometry.angle_axis(true), 0.01 * np.eye(3), images=ends)
+    solution = jaxba.solve(problem)
+    assert solution.converged
+    assert solution.iterations <= 8
+    assert solution.final_cost < 1e-4
+    np.testing.assert_allclose(geometry.camera_centers(solution.problem.cameras), places[states], atol=5e-3)
+
+
 def test_wrong_times_are_one_line():
     t, rates, forces = samples(200.0)
     with pytest.raises(ValueError, match="times and moments must ascend"):
