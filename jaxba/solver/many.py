@@ -6,6 +6,7 @@ fits no cell, and what would not pay for compiling, is solved by `solve`."""
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import threading
 import time
@@ -72,7 +73,8 @@ def solve_many(
         options: as for `solve`; they hold for all.
 
     Raises:
-        ValueError: bad options, or several processes, before the first result."""
+        ValueError: bad options, or several processes, before the first result.
+        Exception: what reading `problems` raises, after the results of those that were read."""
     if jax.distributed.is_initialized():
         raise ValueError("solve_many is for one process: start others without connecting them, and divide the problems")
     options = checked_options(options)
@@ -85,7 +87,8 @@ def solve_many(
 def _results(
     problems: Iterable[BundleProblem | Exception], policy: DampingPolicy, options: SolveOptions
 ) -> Generator[Result, None, None]:
-    stream = iter(problems)
+    failures = list[Exception]()
+    stream = _read(problems, failures)
     for first in stream:
         yield (result := _alone(policy, options, first))
         if isinstance(result, Solution):
@@ -102,6 +105,16 @@ def _results(
             yield waiting.popleft().result()
     finally:
         many.close()
+    if failures:
+        raise failures[0]
+
+
+def _read(problems: Iterable[Any], failures: list[Exception]) -> Generator[Any, None, None]:
+    """The problems up to the first that cannot be read, whose exception is then among the failures."""
+    try:
+        yield from problems
+    except Exception as error:
+        failures.append(error)
 
 
 def _alone(policy: DampingPolicy, options: SolveOptions, problem: Any) -> Result:
@@ -140,8 +153,13 @@ class _Many:
         one_device = options.devices in (None, 1)
         self._in_lanes = plain and options.max_iterations > 0 and one_device
         # two solves on several devices at a time would wait for each other
-        self._pool = ThreadPoolExecutor(len(self._devices) if one_device else 1)
-        self._busy, self._turn = 0, itertools.count()
+        self._threads = len(self._devices) if one_device else 1
+        self._pool = ThreadPoolExecutor(self._threads)
+        self._pending = deque[tuple[Sequence[_Job], Callable[..., None], tuple[Any, ...]]]()
+        self._busy = 0  # works that are pending or under way
+        self._turn = itertools.count()
+        self._closed = False
+        atexit.register(self.close)  # a generator that lives until then is closed when modules are gone
 
     def add(self, problem: Any) -> Future[Result]:
         """The result that a problem will have; perhaps that it is none."""
@@ -182,8 +200,13 @@ class _Many:
             self._submit(cell)
 
     def close(self) -> None:
-        """Ends after what is being solved."""
-        self._pool.shutdown(cancel_futures=True)
+        """Begins nothing more. Does not wait: it may be the garbage collector in one of the threads that calls it."""
+        if self._closed:
+            return
+        self._closed = True
+        atexit.unregister(self.close)
+        self._pending.clear()
+        self._pool.shutdown(wait=False)
 
     def _sort(self, *, endless: bool) -> None:
         """Chooses cells for problems that fit none."""
@@ -213,16 +236,24 @@ class _Many:
             self._begin(bank, self._solve, cell, self._devices[next(self._turn) % len(self._devices)])
 
     def _begin(self, jobs: Sequence[_Job], work: Callable[..., None], *arguments: Any) -> None:
-        """Work for a thread (`_guarded`)."""
-
-        def run() -> None:
-            _guarded(jobs, work, *arguments)
-            with self._lock:
-                self._busy -= 1
-
+        """Work for a thread (`_guarded`). The pool has no more of it than threads: it does all that it has, also when
+        Python ends."""
+        self._pending.append((jobs, work, arguments))
         with self._lock:
             self._busy += 1
-        self._pool.submit(run)
+            is_idle = self._busy <= self._threads
+        if is_idle:
+            self._pool.submit(self._work)
+
+    def _work(self) -> None:
+        """Does what is pending first, and lets the pool go on."""
+        jobs, work, arguments = self._pending.popleft()
+        _guarded(jobs, work, *arguments)
+        with self._lock:
+            self._busy -= 1
+            more = self._busy >= self._threads
+        if more:
+            self._pool.submit(self._work)
 
     def _solve_alone(self, jobs: Sequence[_Job]) -> None:
         for job in jobs:
