@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jaxba import residuals
-from jaxba.constraints import values
-from jaxba.io.colmap.read import principal_points
-from jaxba.io.files import StrPath, reason
+from jaxba.constraints import depth_maps, values
+from jaxba.io.files import StrPath
 from jaxba.io.notes import report
 from jaxba.io.positions import read_gravity
 from jaxba.model.registration import with_residual
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.geometry import COLMAP_FLIP
-from jaxba.problem.hold import every_lens
 from jaxba.problem.labels import Part
 from jaxba.problem.row_data import is_unit
 
@@ -113,10 +109,10 @@ def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool) 
 
 
 def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool, model: StrPath | None) -> BundleProblem:
-    """Depths from maps of the size of their images, each with a scale, at first the median, and a shift, at first 0.
+    """Depths from maps of the shape of their images, each with a scale, at first the median, and a shift, at first 0.
 
     Of a BAL lens, whose pixels do not say where the image is, the principal point is that of the model, or else the
-    middle of the map."""
+    middle of the map. Raises ValueError: a map has another shape than its image, or disparities; one line."""
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
     folder, loss = values.beside(where, value, "folder"), values.parse_loss(value)
     if not folder.is_dir():
@@ -129,36 +125,19 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool, m
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
     leave_out(where, "image", "{} without a map", missing, strict)
     camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)
-    flip, origins, labels = np.ones(2), np.zeros((problem.num_cameras, 2)), problem.labels
-    if every_lens(problem).all_bal:
-        flip = COLMAP_FLIP[:2]
-        origins = None if labels is None or model is None else principal_points(model, labels.images.tolist())
+    placed = depth_maps.pixels_of_images(problem, model)
     for at, file in enumerate(files):
         if file is not None:
             own = np.flatnonzero(camera == at)
-            pixels = np.asarray(problem.observations)[own] * flip
-            measured[own] = _looked_up(file, pixels, None if origins is None else origins[at])
+            measured[own] = depth_maps.looked_up(file, placed, own, at)
     kept = np.flatnonzero(np.isfinite(measured))
     if not len(kept):
         raise ValueError(f"{folder}: no map has a depth at a pixel of the problem")
     images, image = np.unique(camera[kept], return_inverse=True)
-    measured, ratio = measured[kept], measured[kept] / geometry.depths(problem)[kept]
+    measured, depths = measured[kept], geometry.depths(problem)[kept]
+    depth_maps.refuse_disparities(folder, image, measured, depths)
+    ratio = measured / depths
     start = [[np.median(ratio[image == k]), 0.0] for k in range(len(images))]
     index = {"pose": camera[kept], "point": np.asarray(problem.point_index)[kept], "image": image}
     rows = residuals.depth(**index, measured=measured, sigma=relative * measured)
     return with_residual(problem, rows, loss=loss, unknowns={"image": start})
-
-
-def _looked_up(
-    file: Path, pixels: Float[np.ndarray, "n 2"], origin: Float[np.ndarray, "2"] | None
-) -> Float[np.ndarray, " n"]:
-    """Depths of a map at pixels from an origin in it; None: its middle. NaN where there is none."""
-    try:
-        depths = np.asarray(np.load(file, allow_pickle=False), np.float64)
-        height, width = depths.shape
-    except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{file}: no matrix of depths: {reason(error)}") from None
-    column, row = np.floor(pixels + ([width / 2, height / 2] if origin is None else origin)).astype(int).T
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    found = depths[np.where(inside, row, 0), np.where(inside, column, 0)]
-    return np.where(inside & (found > 0) & np.isfinite(found), found, np.nan)

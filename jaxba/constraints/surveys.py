@@ -7,29 +7,37 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxba import residuals
-from jaxba.constraints import values
+from jaxba.constraints import marks_fit, values
 from jaxba.constraints.measurements import leave_out, parts_of
-from jaxba.io.colmap.read import principal_points
+from jaxba.io.colmap.read import image_sizes, principal_points
 from jaxba.io.control_points import read_control_points
 from jaxba.io.files import StrPath
 from jaxba.io.geodesy import Frame, in_frame, is_geographic
 from jaxba.io.notes import report
 from jaxba.io.positions import Positions, read_database, read_photos, read_table, read_transforms
 from jaxba.model.registration import with_residual
-from jaxba.problem.alignment import alignment
+from jaxba.problem.alignment import alignment, check_axes, misfit_text
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.geometry import COLMAP_FLIP
+from jaxba.problem.geometry import COLMAP_FLIP, camera_centers
 from jaxba.problem.hold import every_lens
 from jaxba.problem.losses import Loss
 from jaxba.problem.marks import Marks, with_marks
 from jaxba.problem.measured import with_position_priors
+from jaxba.problem.misfit import on_its_head
 from jaxba.problem.similarity import transformed
 from jaxba.results.retriangulate import retriangulate
 
 POSITIONS = "positions: {name or id: [x, y, z]}, or file, database or photos; crs, stddev, loss, loss_scale and align"
 """What the key `position_priors` holds."""
+
+ON_ITS_HEAD = (
+    "the scene stands on its head, and would fit as well if an axis were mirrored: are two axes swapped, or is one "
+    "reversed?"
+)
+"""Note on places in a plane, which fit a scene that is turned over as well."""
 
 SOURCES = ("file", "database", "photos")  # keys that say where positions are read
 
@@ -60,6 +68,9 @@ def with_positions(
         places, frame = in_frame(places, crs, frame)
         report([f"{where}: the scene is in {frame}"])
     found = with_position_priors(problem, places, covariances[kept], images=images, loss=loss, align=align)
+    if align and crs and on_its_head(found):
+        centres = camera_centers(found.cameras)[images]
+        report([f"{where}: {ON_ITS_HEAD}"] if check_axes(centres, places, covariances[kept]) else [])
     return found, frame
 
 
@@ -82,7 +93,15 @@ def with_control_points(
         raise ValueError(f"check: there is no point {unknown[0]}; there are {values.names_of(given.names)}")
     items = [[name] for name in _full_names(problem, given.images)]
     (image,), kept = parts_of(problem, where, "image", items, "pixels", strict)
-    images = np.bincount(given.point[kept], minlength=len(given.names))
+    sizes = np.zeros((problem.num_cameras, 2)) if model is None else image_sizes(model, problem.labels.images.tolist())
+    clicks = marks_fit.Clicks(image, given.point[kept], given.pixels[kept], sizes[image])
+    if (out := marks_fit.outside(clicks, sigma)).any():
+        text = marks_fit.outside_text(clicks, out, given.names, problem.labels.names)
+        if strict:
+            raise ValueError(text)
+        report([f"{where}: {text} They are left out"])
+        clicks = clicks.of(~out)
+    images = np.bincount(clicks.mark, minlength=len(given.names))
     used = np.flatnonzero(images > 1)
     few = [name for name, count in zip(given.names, images, strict=True) if count < 2]
     if not len(used):
@@ -96,31 +115,61 @@ def with_control_points(
         report([] if problem.residuals else [f"{where}: the scene is in {found}"])
     names = tuple(given.names[at] for at in used)
     marks = Marks(names, places, stddev[used], np.isin(names, checks))
-    seen = np.isin(given.point[kept], used)
-    image, pixels = image[seen], given.pixels[kept][seen]
+    clicks = clicks.of(np.isin(clicks.mark, used))
+    clicks = clicks._replace(mark=np.searchsorted(used, clicks.mark))
+    origins = np.zeros((problem.num_cameras, 2))
     if bal and model is not None:
-        pixels = (pixels - principal_points(model, problem.labels.images[image].tolist())) * COLMAP_FLIP[:2]
-    align = values.parse_truth("align", value.get("align", "true")) and not problem.residuals
-    of_mark = np.searchsorted(used, given.point[kept][seen])
-    problem = with_marks(problem, image, of_mark, pixels, sigma, names)
-    return _on_marks(problem, marks, values.parse_loss(value), align), marks
+        origins = principal_points(model, problem.labels.images.tolist())
+
+    def observed(pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        return (pixels - origins[clicks.image]) * COLMAP_FLIP[:2] if bal else pixels
+
+    align = values.parse_truth("align", value.get("align", "true"))
+    problem = with_marks(problem, clicks.image, clicks.mark, observed(clicks.pixels), sigma, names)
+    problem = _where_rays_meet(problem, len(names))
+    marks_fit.check_pixels(where, problem, clicks, names, sigma, observed)
+    return _on_marks(where, problem, marks, values.parse_loss(value), align), marks
 
 
-def _on_marks(problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> BundleProblem:
-    """The problem with its marks where their rays meet, moved to the measured places of the control points among them
-    if asked for, with the rows of these."""
-    first, control = problem.num_points - len(marks.names), np.flatnonzero(~marks.check)
+def _where_rays_meet(problem: BundleProblem, count: int) -> BundleProblem:
+    """The problem with its last points where their rays meet."""
+    first = problem.num_points - count
     alone = np.asarray(problem.point_index) >= first
     seen = np.unique(np.asarray(problem.camera_index)[alone])
     met = retriangulate(problem.subset(alone, seen, np.arange(first, problem.num_points))).problem.points
-    problem = problem.replace(points=np.concatenate([np.asarray(problem.points)[:first], met]))
+    return problem.replace(points=np.concatenate([np.asarray(problem.points)[:first], met]))
+
+
+def _on_marks(where: str, problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> BundleProblem:
+    """The problem with rows of the control points among its marks, moved to these if nothing else placed it.
+
+    Args:
+        where: file and key, for notes.
+        problem: with the marks as its last points.
+        marks: these.
+        loss: of the rows.
+        align: whether the problem may be moved, and what does not fit before the solve is said."""
+    first = problem.num_points - len(marks.names)
+    control = np.flatnonzero(~marks.check)
+    met = np.asarray(problem.points)[first:]
+    covariances = marks.stddev[:, :, None] ** 2 * np.eye(3)
+    notes = []
+    if align and problem.residuals:
+        notes.append(marks_fit.places_text(problem, marks, met))
+    elif align and len(control):
+        planar = check_axes(met, marks.places, covariances)
+        fit, chi = alignment(met[control], marks.places[control], covariances[control])
+        problem = transformed(problem, fit)
+        away = fit.points(met[control]) - marks.places[control]
+        names = [marks.names[at] for at in control]
+        notes.append(misfit_text(names.__getitem__, "points", away, marks.places[control], covariances[control], chi))
+        if planar and on_its_head(problem):
+            notes.append(ON_ITS_HEAD)
+    report([f"{where}: {text}" for text in notes if text])
     if not len(control):
         return problem
-    places, stddev = marks.places[control], marks.stddev[control]
-    if align:
-        fit, _ = alignment(np.asarray(met)[control], places, stddev[:, :, None] ** 2 * np.eye(3))
-        problem = transformed(problem, fit)
-    rows = residuals.control_point(point=first + control, position=places, whitening=np.eye(3) / stddev[:, None])
+    whitening = np.eye(3) / marks.stddev[control][:, None]
+    rows = residuals.control_point(point=first + control, position=marks.places[control], whitening=whitening)
     return with_residual(problem, rows, loss=loss)
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.labels import part_name
+from jaxba.problem.misfit import BENDS, MISFIT, extent_of, off_by, wrong_places, wrong_text
 from jaxba.problem.similarity import Similarity, along_line, transformed, umeyama
 
 ROUNDS, KEPT = 10, 0.5
@@ -20,18 +23,19 @@ three images on a line with this spread across it determine the roll about it to
 
 MOST = 0.75  # share of the images that must fit: it is noted if fewer do
 
-DOUBTFUL, MISFIT = 2.0, 5.0
-"""Distance, over that of noise, from which other axes or units are tried, and from which positions do not fit."""
+DOUBTFUL = 2.0  # distance, over that of noise, from which other axes or units are tried
 
 BETTER, EXPLAINED, LEAST_IMAGES = 0.3, 0.1, 5
 """Other axes or units are taken for the true ones if they leave this share of the misfit, and no more than this share
-of the extent, with so many images: four fit too well by chance."""
+of the extent, with so many images: of four, half fit too well by chance, so that all must fit."""
 
 MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
 """Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
 
 LARGEST_AREA, EARTH = 1.0, 6.371e6
 """Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent. Radius, metres."""
+
+_MIRRORED = np.outer([-1, 1, 1], [-1, 1, 1])  # signs of a covariance once x is mirrored
 
 NOT_DETERMINED = (
     "the positions are at one place within their noise: the alignment only moves the scene",
@@ -48,19 +52,67 @@ def aligned(
 ) -> BundleProblem:
     """The problem moved, turned and scaled so that the centres of images are near the given positions.
 
-    Another `ProblemWarning` than those of `alignment` says that the positions do not fit. Raises ProblemError: as that
-    does."""
+    Other `ProblemWarning`s than those of `alignment` say which positions do not fit, or that they do not fit together.
+    Raises ProblemError: as that does."""
     if not len(images):
         return problem
     centers = geometry.camera_centers(problem.cameras)[images]
     best, chi = alignment(centers, positions, covariances)
-    if chi > MISFIT:
-        away = np.quantile(np.linalg.norm(best.points(centers) - positions, axis=1), MOST)
-        _note(
-            f"a quarter of the images of the aligned scene are {away:.3g} or more from their positions, {chi:.3g} "
-            "times what the standard deviations explain"
-        )
+
+    def name(at: int) -> str:
+        return part_name(problem.labels, "image", int(images[at]))
+
+    text = misfit_text(name, "images", best.points(centers) - positions, positions, covariances, chi)
+    if text:
+        _note(text)
     return transformed(problem, best)
+
+
+def misfit_text(
+    name: Callable[[int], str],
+    kind: str,
+    away: Float[np.ndarray, "n 3"],
+    positions: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    chi: float,
+) -> str:
+    """Which measured positions the aligned scene does not have, or that many do not fit; empty if they do.
+
+    Args:
+        name: what a position is of.
+        kind: what these are called.
+        away: places of the aligned scene less the positions.
+        positions: measured, scene units.
+        covariances: of these.
+        chi: misfit over that of noise, as `alignment` has it."""
+    wrong = wrong_places(positions, away, covariances)
+    if len(wrong):
+        return f"measured positions do not fit the others: {wrong_text(name, wrong, away, covariances)}"
+    distance, _ = off_by(away, covariances)
+    most = float(np.quantile(distance, MOST))
+    if chi > MISFIT and most > BENDS * extent_of(positions):
+        return (
+            f"a quarter of the {kind} of the aligned scene are {most:.3g} or more from their positions, {chi:.3g} "
+            f"times what the standard deviations explain; the farthest is {name(int(np.argmax(distance)))}"
+        )
+    return ""
+
+
+def check_axes(
+    places: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+) -> bool:
+    """Whether measured positions fit places of a scene as well if an axis is mirrored, as those in a plane do.
+
+    Raises ProblemError: they fit well with other axes or units only."""
+    best, _ = _robust_fit(places, positions, covariances)
+    mirrored = positions * [-1, 1, 1]
+    other, _ = _robust_fit(places, mirrored, covariances * _MIRRORED)
+    misfit = float(np.max(_distances(best, places, positions, covariances)))
+    if misfit > DOUBTFUL * NEARLY_ALL:
+        _refuse_other_axes(places, positions)
+    return float(np.max(_distances(other, places, mirrored, covariances * _MIRRORED))) < DOUBTFUL * max(
+        misfit, NEARLY_ALL
+    )
 
 
 def alignment(
@@ -154,8 +206,9 @@ def _distances(
 
 def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
     """Raises ProblemError: positions fit well with other axes or units only: degrees, or mirrored."""
-    if len(centers) < LEAST_IMAGES:
+    if len(centers) < LEAST_IMAGES - 1:
         return
+    few = len(centers) < LEAST_IMAGES
     others = [(positions * [-1, 1, 1], "mirrored: are two axes swapped, or is one reversed?")]
     for latitude, longitude in ((0, 1), (1, 0)):
         middle = np.median(positions, axis=0)
@@ -166,15 +219,18 @@ def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
             others.append((metres, "latitude and longitude in degrees: give metres, or crs: EPSG:4326"))
     misfit = _misfit(centers, positions)
     for other, what in others:
-        if _misfit(centers, other) < min(BETTER * misfit, EXPLAINED):
+        if _misfit(centers, other) < min((EXPLAINED if few else BETTER) * misfit, EXPLAINED):
             raise ProblemError(f"the positions seem to be {what} (align: false takes them as they are)")
 
 
 def _misfit(centers: np.ndarray, positions: np.ndarray) -> float:
-    """Median distance of the centres from the positions that they best fit, as a share of the extent."""
+    """Median distance of the centres from the positions that they best fit, as a share of the extent; of few ones the
+    largest distance."""
     extent = float(np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
     if not extent > 0:
         return np.inf
+    few = len(centers) < LEAST_IMAGES
     small = np.broadcast_to((1e-6 * extent) ** 2 * np.eye(3), (len(positions), 3, 3))
-    fit, _ = _robust_fit(centers, positions, small)
-    return float(np.median(np.linalg.norm(fit.points(centers) - positions, axis=1))) / extent
+    fit, _ = _fit(centers, positions, small) if few else _robust_fit(centers, positions, small)
+    distance = np.linalg.norm(fit.points(centers) - positions, axis=1)
+    return float(distance.max() if few else np.median(distance)) / extent

@@ -131,10 +131,23 @@ def test_positions_that_do_not_fit_are_noted_and_those_that_do_are_not():
     with pytest.warns(ProblemWarning, match=r"a quarter of the images .* times what the standard deviations explain"):
         with_position_priors(problem, positions * [1, 1, 3], stddev=0.5)
     some = positions + 0.5 * rng.normal(size=positions.shape)
-    some[:2] += [500.0, -300.0, 0.0]
-    found = with_position_priors(problem, some, stddev=0.5)
+    with_position_priors(problem, some, stddev=0.5)
+
+
+def test_wrong_positions_are_named_and_do_not_move_the_scene():
+    problem, positions = block()
+    some = positions + 0.5 * np.random.default_rng(3).normal(size=positions.shape)
+    some[[4, 7]] += [500.0, -300.0, 0.0]
+    with pytest.warns(ProblemWarning, match=r"the others: camera [47] is 58\d .*, camera [47] is 58\d .*\)$"):
+        found = with_position_priors(problem, some, stddev=0.5)
     away = np.linalg.norm(geometry.camera_centers(found.cameras) - positions, axis=1)
-    assert away.max() < 1.5, "two of the positions wrong, and no warning"
+    assert away.max() < 1.5
+
+
+def test_four_positions_with_an_axis_mirrored_are_refused():
+    problem, positions = block()
+    with pytest.raises(ProblemError, match="mirrored: are two axes swapped"):
+        with_position_priors(problem, positions[:4] * [1, 1, -1], stddev=0.02, images=range(4))
 
 
 def test_exact_images_count_more_than_rough_ones():

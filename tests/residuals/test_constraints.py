@@ -94,7 +94,7 @@ def test_relative_poses_have_quaternions_or_angle_axis_vectors(said):
 @pytest.mark.parametrize("model", ["BAL", "SIMPLE_PINHOLE"])
 def test_depth_maps_are_looked_up_at_pixels_and_find_their_scales(model, problem, tmp_path):
     """Maps with twice the depth and a half; one image has none, and one pixel of another has no depth."""
-    width, height, scale, shift = 640, 480, 2.0, 0.5
+    width, height, scale, shift = 900, 700, 2.0, 0.5
     if model == "SIMPLE_PINHOLE":
         cameras = np.hstack([problem.cameras[:, :7], np.tile([width / 2, height / 2], (5, 1))])
         kinds, free = (CAMERA_MODELS[model],), np.zeros((5, 3), bool)
@@ -134,17 +134,17 @@ def test_depth_maps_are_looked_up_from_the_principal_points_of_a_model(problem, 
     write_colmap(problem, tmp_path / "old")
     model = read_model(tmp_path / "old")
     move = np.array([40.0, -25.0])  # of principal points, and of all pixels with them
-    cameras = {
-        key: replace(one, params=(one.params[0], *(one.params[1:3] + move), *one.params[3:]))
-        for key, one in model.cameras.items()
-    }
+    cameras = {}
+    for key, one in model.cameras.items():
+        params = (one.params[0], *(one.params[1:3] + move), *one.params[3:])
+        cameras[key] = replace(one, params=params, width=one.width + 99, height=one.height + 99)
     images = {key: replace(one, keys=one.keys.copy()) for key, one in model.images.items()}
     for image in images.values():
         image.keys["xy"] += move
     write_model(replace(model, cameras=cameras, images=images), tmp_path / "new", ".bin")
     for image in images.values():
         camera = cameras[image.camera]
-        depths = np.zeros((camera.height + 99, camera.width + 99))
+        depths = np.zeros((camera.height, camera.width))
         column, row = np.floor(image.keys["xy"]).astype(int).T
         depths[row, column] = image.keys["point"]
         np.save(tmp_path / f"{image.name.decode()}.npy", depths)

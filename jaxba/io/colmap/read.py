@@ -83,6 +83,13 @@ def principal_points(folder: StrPath, images: Iterable[int]) -> Float[np.ndarray
     return np.array([model.cameras[model.images[image].camera].principal_point for image in images])
 
 
+def image_sizes(folder: StrPath, images: Iterable[int]) -> Float[np.ndarray, "n 2"]:
+    """Width and height of images by id, pixels. Raises ProblemError: as `read_colmap`."""
+    model = read_model(folder)
+    cameras = [model.cameras[model.images[image].camera] for image in images]
+    return np.array([(camera.width, camera.height) for camera in cameras], np.float64).reshape(-1, 2)
+
+
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
     """The problem of a model, whose principal points are optimised if asked for. Raises ProblemError: it is not known
     where a camera is in its rig, a lens cannot be used, or nothing is observed."""
