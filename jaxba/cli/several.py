@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxba.cli import common
+from jaxba.cli.costs import COSTS, Row, append_row, files_digest, is_there, options_digest, solved_rows, write_rows
 from jaxba.cli.output import store
 from jaxba.cli.overwriting import check_apart, problem_files
 from jaxba.damping import DampingPolicy
@@ -20,13 +19,10 @@ from jaxba.datasets.bal.paths import resolve
 from jaxba.io import formats, is_colmap
 from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.runtime.atomic import atomic_write
 from jaxba.runtime.interrupt import INTERRUPTED, Interrupt
 from jaxba.solver.many import Result, solve_many
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import Solution
-
-COSTS = "costs.csv"  # name of the file of costs in the folder of solutions
 
 FOR_ONE = (
     *(
@@ -46,31 +42,6 @@ FOR_ONE = (
 """Options of a single problem."""
 
 PROGRESS_S = 0.2, 10.0  # seconds between lines of progress on a terminal, where each replaces the last, and elsewhere
-
-
-class Row(NamedTuple):
-    """A row of the file of costs."""
-
-    problem: str
-    cameras: int | str = ""
-    points: int | str = ""
-    observations: int | str = ""
-    initial_cost: float | str = ""  # pixels^2
-    final_cost: float | str = ""
-    iterations: int | str = ""
-    end: str = ""  # why it ended
-    notes: str = ""  # what was measured and does not fit
-    error: str = ""  # why there is no solution
-
-    @classmethod
-    def of(cls, name: str, result: Result) -> Row:
-        """That of a result."""
-        if not isinstance(result, Solution):
-            return cls(name, error=" ".join(str(result).split()))
-        problem = result.problem
-        sizes = problem.num_cameras, problem.num_points, problem.num_observations
-        costs, notes = (result.initial_cost, result.final_cost), "; ".join(result.notes)
-        return cls(name, *sizes, *costs, result.iterations, result.termination.reason, notes)
 
 
 def inputs(problems: Sequence[str]) -> list[str]:
@@ -103,21 +74,21 @@ def solve_all(
     common.require(bool(args.output) or not args.resume, "--resume goes on with the folder of --output")
     names = _names(paths)
     folder = Path(args.output) if args.output else None
-    done = _begin(folder, paths, names, resume=args.resume) if folder else {}
+    made_by = options_digest(args, policy, options)
+    done = _begin(folder, paths, names, made_by, resume=args.resume) if folder else set()
     left = [(path, name) for path, name in zip(paths, names, strict=True) if name not in done]
-    if done:
-        common.print_line(f"{len(paths) - len(left)} of {len(paths)} are there already")
     common.prepare_process()
     began, shown, rows = time.monotonic(), -1e9, list[Row]()
     every, end = (PROGRESS_S[0], "") if sys.stderr.isatty() else (PROGRESS_S[1], "\n")
-    found = contextlib.closing(solve_many(_Problems([path for path, _ in left], read), policy, options))
+    problems = _Problems([path for path, _ in left], read)
+    found = contextlib.closing(solve_many(problems, policy, options))
     with common.notes_printed(), Interrupt("problem", graceful=True) as interrupt, found as results:
         for (path, name), result in zip(left, results, strict=False):
             if folder and isinstance(result, Solution):
                 result = _stored(folder / name, result, path)
-            rows.append(Row.of(name, result))
+            rows.append(Row.of(name, result, options=made_by, files=problems.digests.pop(path)))
             if folder:
-                _append(folder / COSTS, rows[-1])
+                append_row(folder / COSTS, rows[-1])
             now = time.monotonic()
             if not isinstance(result, Solution):
                 text, known = rows[-1].error, display_name(path)
@@ -152,16 +123,22 @@ class _Problems:
 
     def __init__(self, paths: Sequence[str], read: Callable[[str], BundleProblem]) -> None:
         self._paths, self._read = paths, read
+        self.digests = dict[str, str]()
+        """Of the files of each problem, from before it was read."""
 
     def __len__(self) -> int:
         return len(self._paths)
 
     def __iter__(self) -> Iterator[Any]:
         for path in self._paths:
+            self.digests[path] = ""
             try:
-                yield self._read(path)
+                self.digests[path] = files_digest(path)
+                problem = self._read(path)
             except (ProblemError, OSError) as error:
                 yield error
+            else:
+                yield problem
 
 
 def _names(paths: Sequence[str]) -> list[str]:
@@ -181,28 +158,42 @@ def _written(name: str, source: str) -> str:
     return f"{name}.txt" if lost and not is_colmap(source) else name
 
 
-def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], *, resume: bool) -> dict[str, list[str]]:
-    """Makes the folder, and gives the rows that it holds already. A last line that was cut is dropped."""
+def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: str, *, resume: bool) -> set[str]:
+    """Makes the folder and its file of costs, and says what is done already.
+
+    Args:
+        folder: of the solutions.
+        paths: of all problems.
+        names: of their solutions.
+        made_by: digest of the options.
+        resume: whether a run may go on.
+
+    Returns:
+        Names of solutions that are there, made by the same options from the same files.
+
+    Raises:
+        UsageError: a solution would replace a file of a problem, or the folder holds what it may not; one line."""
     common.check_folder("--output", str(folder))
     written = {str(path): [folder / name] for path, name in zip(paths, names, strict=True)}
     check_apart(written, {"a problem": [file for path in paths for file in problem_files(path)]})
     folder.mkdir(exist_ok=True)
-    costs, rows = folder / COSTS, dict[str, list[str]]()
-    if costs.exists():
-        common.require(resume, f"--output {folder}: holds {COSTS} of an earlier run; --resume goes on with it")
-        content = costs.read_bytes()
-        whole = io.StringIO(os.fsdecode(content[: content.rfind(b"\n") + 1]), newline="")
-        rows = {row[0]: row for row in list(csv.reader(whole))[1:] if row and not row[-1]}
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([Row._fields, *rows.values()])
-    with atomic_write(costs) as file:
-        file.write(os.fsencode(text.getvalue()))  # names of files may be no text
-    return rows
-
-
-def _append(costs: Path, row: Row) -> None:
-    with costs.open("a", newline="", encoding="utf-8", errors="surrogateescape") as file:
-        csv.writer(file, lineterminator="\n").writerow(row)
+    costs = folder / COSTS
+    where = f"--output {folder}: holds {COSTS} of"
+    common.require(resume or not costs.exists(), f"{where} an earlier run; --resume goes on with it")
+    rows = solved_rows(costs)
+    same = all(row.options == made_by for row in rows.values())
+    common.require(same, f"{where} other options, constraints or policy: repeat those, or name another folder")
+    path_of = dict(zip(names, paths, strict=True))
+    there = {name for name in rows if name in path_of and is_there(folder / name)}
+    done = {name for name in there if rows[name].files == files_digest(path_of[name])}
+    anew = [name for name in rows if name in path_of and name not in done]
+    write_rows(costs, [row for name, row in rows.items() if name not in anew])
+    if rows:
+        common.print_line(f"{len(done)} of {len(paths)} are there already")
+    if anew:
+        changed, lost = len(there - done), len(anew) - len(there - done)
+        common.print_line(f"solved anew: {changed} whose files have changed, {lost} whose solutions are not there")
+    return done
 
 
 def _stored(output: Path, solution: Solution, source: str) -> Result:

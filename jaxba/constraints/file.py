@@ -16,6 +16,7 @@ from jaxba.constraints.surveys import POSITIONS, with_control_points, with_posit
 from jaxba.constraints.values import meant, parse_items, parse_mapping, parse_numbers
 from jaxba.io.files import StrPath
 from jaxba.io.geodesy import Frame, projected
+from jaxba.io.notes import report as note
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.checks import shown
 from jaxba.problem.gauge import Gauge, with_gauge
@@ -122,6 +123,8 @@ def constrained(
         marks, value = None, settings.get(key)
         if isinstance(value, dict) and "file" in value:
             problem, marks = with_control_points(problem, f"{file}: {key}", settings.pop(key), strict, frame, model)
+    if frame is not None and frame.crs and marks is None and not problem.residuals:
+        note([f"{file}: crs: nothing moves the scene there: it needs position_priors or a file of control_points"])
     problem = held(problem)
     with _named(file, "gauge"):
         gauge = settings.pop("gauge", "free")

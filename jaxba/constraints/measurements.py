@@ -15,6 +15,7 @@ from jaxba.io.positions import read_gravity
 from jaxba.model.registration import with_residual
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.image_names import named_images
 from jaxba.problem.labels import Part
 from jaxba.problem.row_data import is_unit
 
@@ -80,32 +81,85 @@ def with_measured(
 
 
 def parts_of(
-    problem: BundleProblem, where: str, kind: Part, items: list[list[str]], what: str, strict: bool
+    problem: BundleProblem,
+    where: str,
+    kind: Part,
+    items: list[list[str]],
+    what: str,
+    strict: bool,
+    *,
+    table: bool = False,
 ) -> tuple[Int[np.ndarray, "n kept"], Int[np.ndarray, " kept"]]:
-    """Images or points of those items that name no others, and which items these are. Others are left out with a note.
-    Raises ValueError: none is left, or one is left out and `strict`; one line."""
-    labels, image = problem.labels, kind == "image"
-    names = frozenset(labels.names if labels is not None and image else ())
-    count = problem.num_cameras if image else problem.num_points
-    ids = set(range(count) if labels is None else (labels.images if image else labels.points).tolist())
-    wanted = np.array([values.meant(item, names) for item in items], object)
-    known = np.array([[one in names or one in ids for one in item] for item in wanted])
-    kept, others = np.flatnonzero(known.all(axis=1)), list(dict.fromkeys(np.array(items)[~known]))
+    """Images or points of those items that name no others, and which items these are.
+
+    Args:
+        problem: the problem.
+        where: what notes begin with.
+        kind: what the items are.
+        items: names or ids, as text; each item has n of them.
+        what: what is left out with an item.
+        strict: whether to refuse what would be left out with a note.
+        table: whether another program wrote the names, so that numbers are names of images rather than ids.
+
+    Returns:
+        Positions in the problem, and which items they are of.
+
+    Raises:
+        ValueError: none is left, or one is left out and `strict`; one line."""
+    positions, doubts = _positions_of(problem, kind, [name for item in items for name in item], table)
+    known = np.array([[name in positions for name in item] for item in items])
+    kept = np.flatnonzero(known.all(axis=1))
+    others = list(dict.fromkeys(np.array(items, object)[~known]))
+    example = f"; it has {problem.labels.names[0]}" if kind == "image" and problem.labels is not None else ""
+    unclear = [name for name in others if name in doubts]
+    unknown = [name for name in others if name not in doubts]
     if not len(kept):
-        raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others)}")
-    leave_out(where, kind, f"{what} of {{}} that the problem does not have", others, strict)
-    flat = wanted[kept].T.ravel()
-    at = flat.astype(int) if labels is None else labels.positions(kind, flat)
-    return at.reshape(-1, len(kept)), kept
+        doubt = f"; {doubts[unclear[0]]}" if unclear else example
+        raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others)}{doubt}")
+    leave_out(where, kind, f"{what} of {{}} that the problem does not have", unknown, strict, example)
+    if unclear:
+        leave_out(where, kind, f"{what} of {{}} whose names are not clear", unclear, strict, f"; {doubts[unclear[0]]}")
+    at = np.array([[positions[name] for name in items[k]] for k in kept], np.int64)
+    return at.T, kept
 
 
-def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool) -> None:
-    """Notes what is left out, if it is anything: `what`, with the number of what is called `noun`. Raises ValueError:
-    `strict`; one line."""
+def _positions_of(
+    problem: BundleProblem, kind: Part, names: list[str], table: bool
+) -> tuple[dict[str, int], dict[str, str]]:
+    """Positions of images or points by names or ids, and why other names of images are not clear."""
+    labels = problem.labels
+    if labels is None:
+        numbers = range(problem.num_cameras if kind == "image" else problem.num_points)
+    else:
+        numbers = (labels.images if kind == "image" else labels.points).tolist()
+    by_id = {str(number): at for at, number in enumerate(numbers)}
+    by_id = {name: by_id[name] for name in names if name in by_id}
+    if labels is None or kind != "image":
+        return by_id, {}
+    by_name, doubts = named_images(names, labels.names)
+    if table:
+        return by_name or by_id, doubts
+    exact = {name: at for name, at in by_name.items() if labels.names[at] == name}
+    return by_name | by_id | exact, {name: doubt for name, doubt in doubts.items() if name not in by_id}
+
+
+def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool, more: str = "") -> None:
+    """Notes what is left out, if it is anything.
+
+    Args:
+        where: what the note begins with.
+        noun: what the names are of.
+        what: what is left out, with `{}` for the number of them.
+        names: of what it is left out.
+        strict: whether to refuse it.
+        more: what the note ends with.
+
+    Raises:
+        ValueError: `strict`; one line."""
     what = what.format(f"{len(names)} {noun}{'s' * (len(names) != 1)}")
     if names and strict:
-        raise ValueError(f"{what}: {values.names_of(names)}")
-    report([f"{where}: left out {what}: {values.names_of(names)}"] if names else [])
+        raise ValueError(f"{what}: {values.names_of(names)}{more}")
+    report([f"{where}: left out {what}: {values.names_of(names)}{more}"] if names else [])
 
 
 def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool, model: StrPath | None) -> BundleProblem:

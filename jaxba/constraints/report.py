@@ -48,7 +48,9 @@ class Report:
 
     def table(self) -> str:
         """The rows in lines: differences in scene units, RMS pixels, and the RMS of standard deviations."""
-        lines, checks = [], [row.difference for row in self.rows if row.kind == "check" and row.images]
+        lines = []
+        known = [row.difference for row in self.rows if row.kind == "check" and row.images]
+        checks = [difference for difference in known if np.isfinite(difference).all()]
         for names, lengths in ((("x", "y", "z"), False), (("measured", "found", "less"), True)):
             if mine := [row for row in self.rows if (row.kind == "distance") == lengths]:
                 heads = "".join(f"{one:>11}" for one in names) + "  images  pixels  sigmas"

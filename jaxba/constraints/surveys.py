@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba import residuals
 from jaxba.constraints import marks_fit, values
@@ -17,7 +16,9 @@ from jaxba.io.control_points import read_control_points
 from jaxba.io.files import StrPath
 from jaxba.io.geodesy import Frame, in_frame, is_geographic
 from jaxba.io.notes import report
-from jaxba.io.positions import Positions, read_database, read_photos, read_table, read_transforms
+from jaxba.io.position_tables import Positions
+from jaxba.io.positions import read_database, read_file, read_photos
+from jaxba.io.tables import has_fix
 from jaxba.model.registration import with_residual
 from jaxba.problem.alignment import alignment, check_axes, misfit_text
 from jaxba.problem.bundle_problem import BundleProblem
@@ -47,31 +48,74 @@ def with_positions(
 ) -> tuple[BundleProblem, Frame | None]:
     """The problem with measured positions of images, and the frame of the scene where positions are on the earth. The
     rest is as for `with_measured`."""
-    source = next((one for one in SOURCES if isinstance(value, dict) and one in value), None)
-    if source is None:
-        items, columns = values.parse_vectors(value, "positions", "image", (), ("align", "crs"))
-        names, crs = [item[0] for item in items], _crs(value)
-        places = np.array(columns["positions"])[:, [1, 0, 2] if crs and is_geographic(crs) else [0, 1, 2]]
-        covariances = columns["stddev"][:, :, None] ** 2 * np.eye(3)
-    else:
-        values.parse_mapping(value, [source], ["crs", "stddev", "loss", "loss_scale", "align"])
-        names, places, covariances, crs = _read(problem, where, source, value, strict)
-        if crs and "crs" in value and not is_geographic(_crs(value)):
-            raise ValueError(f"crs: latitudes and longitudes are not of {_crs(value)}")
-        names, crs = _full_names(problem, names), _crs(value) or crs
-        if covariances is None or "stddev" in value:
-            covariances = values.parse_stddev(value, names, "image")[:, :, None] ** 2 * np.eye(3)
-    loss, align = values.parse_loss(value), values.parse_truth("align", value.get("align", "true"))
-    at, kept = parts_of(problem, where, "image", [[name] for name in names], "positions", strict)
-    places, images = places[kept], at[0].tolist()
+    source = next((key for key in SOURCES if isinstance(value, dict) and key in value), None)
+    given = _inline(value) if source is None else _read(problem, where, source, value, strict)
+    loss = values.parse_loss(value)
+    align = values.parse_truth("align", value.get("align", "true"))
+    items = [[name] for name in given.names]
+    (images,), kept = parts_of(problem, where, "image", items, "positions", strict, table=source is not None)
+    crs = given.crs
+    if not crs and frame is not None:
+        crs = frame.crs
+        report([f"{where}: positions are taken as of {crs}, which the scene gets"])
+    degrees = given.degrees or (crs != "" and is_geographic(crs))
+    chosen = _with_a_place(where, given, images, kept, degrees, strict)
+    images, kept = images[chosen], kept[chosen]
+    places, covariances = given.places[kept], given.covariances
+    report([f"{where}: {note}" for note in given.notes])
     if crs:
-        places, frame = in_frame(places, crs, frame)
+        places, frame = in_frame(places, crs, frame, units=given.units, where=where)
         report([f"{where}: the scene is in {frame}"])
-    found = with_position_priors(problem, places, covariances[kept], images=images, loss=loss, align=align)
+    else:
+        places = places * np.where(np.isnan(given.units), 1.0, given.units)[[0, 0, 1]]
+    assert covariances is not None
+    covariances = covariances[kept]
+    found = with_position_priors(problem, places, covariances, images=images.tolist(), loss=loss, align=align)
     if align and crs and on_its_head(found):
         centres = camera_centers(found.cameras)[images]
-        report([f"{where}: {ON_ITS_HEAD}"] if check_axes(centres, places, covariances[kept]) else [])
+        report([f"{where}: {ON_ITS_HEAD}"] if check_axes(centres, places, covariances) else [])
     return found, frame
+
+
+def _with_a_place(
+    where: str,
+    given: Positions,
+    images: Int[np.ndarray, " n"],
+    rows: Int[np.ndarray, " n"],
+    degrees: bool,
+    strict: bool,
+) -> Int[np.ndarray, " kept"]:
+    """Which images have one place. Others are left out with a note.
+
+    Args:
+        where: what notes begin with.
+        given: positions.
+        images: images of the problem.
+        rows: which of the positions are theirs.
+        degrees: whether they are longitude and latitude.
+        strict: whether to refuse what would be left out.
+
+    Returns:
+        Which of the images these are.
+
+    Raises:
+        ValueError: none has a place, or one has none and `strict`; one line."""
+    places = given.places[rows]
+    fixed = has_fix(places, degrees)
+    lost = [given.names[row] for row in rows[~fixed]]
+    if not fixed.any():
+        raise ValueError(f"no image has a position: all are empty, 0 or impossible, as of {values.names_of(lost)}")
+    leave_out(where, "image", "positions of {} without a fix", lost, strict)
+    kept = np.flatnonzero(fixed)
+    _, first, inverse = np.unique(images[kept], return_index=True, return_inverse=True)
+    kept_first = kept[first]
+    differs = (places[kept] != places[kept_first][inverse]).any(axis=1)
+    several = np.unique(inverse[differs])
+    of_several = [given.names[rows[k]] for k in kept[np.isin(inverse, several)]]
+    what = f"positions of {{}} with other ones in another row, in {len(of_several)} rows"
+    one_each = [given.names[rows[kept_first[k]]] for k in several]
+    leave_out(where, "image", what, one_each, strict)
+    return np.sort(np.delete(kept_first, several))
 
 
 def with_control_points(
@@ -91,8 +135,9 @@ def with_control_points(
     checks = values.parse_items(value.get("check", []), "names")
     if unknown := [name for name in checks if name not in given.names]:
         raise ValueError(f"check: there is no point {unknown[0]}; there are {values.names_of(given.names)}")
-    items = [[name] for name in _full_names(problem, given.images)]
-    (image,), kept = parts_of(problem, where, "image", items, "pixels", strict)
+    crs = _crs(value) or given.crs
+    items = [[name] for name in given.images]
+    (image,), kept = parts_of(problem, where, "image", items, "pixels", strict, table=True)
     sizes = np.zeros((problem.num_cameras, 2)) if model is None else image_sizes(model, problem.labels.images.tolist())
     clicks = marks_fit.Clicks(image, given.point[kept], given.pixels[kept], sizes[image])
     if (out := marks_fit.outside(clicks, sigma)).any():
@@ -101,20 +146,33 @@ def with_control_points(
             raise ValueError(text)
         report([f"{where}: {text} They are left out"])
         clicks = clicks.of(~out)
+    placed = has_fix(given.places, crs != "" and is_geographic(crs))
     images = np.bincount(clicks.mark, minlength=len(given.names))
-    used = np.flatnonzero(images > 1)
-    few = [name for name, count in zip(given.names, images, strict=True) if count < 2]
+    used = np.flatnonzero(placed & (images > 1))
+    nowhere = [name for name, known in zip(given.names, placed, strict=True) if not known]
+    few = [name for name, count, known in zip(given.names, images, placed, strict=True) if known and count < 2]
     if not len(used):
-        raise ValueError("no point is in two images of the problem")
+        why = f"no point has a place: {values.names_of(nowhere)}" if not placed.any() else ""
+        raise ValueError(why or "no point is in two images of the problem")
+    leave_out(where, "point", "{} without a place or height", nowhere, strict)
     leave_out(where, "point", "{} in fewer than two images of the problem", few, strict)
-    places, crs = given.places[used], _crs(value) or given.crs
     if crs and frame is None and problem.residuals:
         raise ValueError("the points have a crs, and position_priors have none")
-    if crs:
-        places, found = in_frame(places, crs, frame)
-        report([] if problem.residuals else [f"{where}: the scene is in {found}"])
     names = tuple(given.names[at] for at in used)
-    marks = Marks(names, places, stddev[used], np.isin(names, checks))
+    check = np.isin(names, checks)
+    align = values.parse_truth("align", value.get("align", "true"))
+    places = given.places[used]
+    alone = check.all() and not problem.residuals
+    if alone and not (crs and align):
+        report([f"{where}: all are check points, and nothing moves the scene: it is taken to be in their frame"])
+    if alone and crs and align:
+        report([f"{where}: all are check points and there are no position_priors: nothing moves the scene to {crs}"])
+        places = np.full_like(places, np.nan)
+    elif crs:
+        own = places if check.all() else places[~check]
+        places, frame = in_frame(places, crs, frame, origin_of=own, where=where)
+        report([] if problem.residuals else [f"{where}: the scene is in {frame}"])
+    marks = Marks(names, places, stddev[used], check)
     clicks = clicks.of(np.isin(clicks.mark, used))
     clicks = clicks._replace(mark=np.searchsorted(used, clicks.mark))
     origins = np.zeros((problem.num_cameras, 2))
@@ -124,7 +182,6 @@ def with_control_points(
     def observed(pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         return (pixels - origins[clicks.image]) * COLMAP_FLIP[:2] if bal else pixels
 
-    align = values.parse_truth("align", value.get("align", "true"))
     problem = with_marks(problem, clicks.image, clicks.mark, observed(clicks.pixels), sigma, names)
     problem = _where_rays_meet(problem, len(names))
     marks_fit.check_pixels(where, problem, clicks, names, sigma, observed)
@@ -173,26 +230,48 @@ def _on_marks(where: str, problem: BundleProblem, marks: Marks, loss: Loss, alig
     return with_residual(problem, rows, loss=loss)
 
 
-def _full_names(problem: BundleProblem, names: list[str]) -> list[str]:
-    """Names of images where one without its folder means the only image of that name."""
-    known = () if problem.labels is None else problem.labels.names
-    counts = Counter(Path(name).name for name in known)
-    full = {base: name for name in known if counts[base := Path(name).name] == 1} | {name: name for name in known}
-    return [full.get(name) or full.get(Path(name).name, name) for name in names]
-
-
 def _crs(value: dict[str, Any]) -> str:
     return values.parse_word(value, "crs") if "crs" in value else ""
 
 
+def _inline(value: Any) -> Positions:
+    """Positions in the file of constraints itself; on the earth latitude stands before longitude."""
+    items, columns = values.parse_vectors(value, "positions", "image", (), ("align", "crs"))
+    crs = _crs(value)
+    degrees = crs != "" and is_geographic(crs)
+    places = np.array(columns["positions"])[:, [1, 0, 2] if degrees else [0, 1, 2]]
+    covariances = columns["stddev"][:, :, None] ** 2 * np.eye(3)
+    return Positions([item[0] for item in items], places, covariances, crs, degrees=degrees)
+
+
 def _read(problem: BundleProblem, where: str, source: str, value: Any, strict: bool) -> Positions:
+    """Positions of a file, a database or photos, with the coordinate system and standard deviations of `value`."""
+    values.parse_mapping(value, [source], ["crs", "stddev", "loss", "loss_scale", "align"])
     path = values.beside(where, value, source)
-    if source != "photos":
-        of_file = read_transforms if path.suffix == ".json" else read_table
-        return (of_file if source == "file" else read_database)(path)
+    crs = _crs(value)
+    geographic = is_geographic(crs) if crs else None
+    if source == "file":
+        given = read_file(path, geographic)
+    elif source == "database":
+        given = read_database(path)
+    else:
+        given = _photos(problem, where, path, strict)
+    if given.degrees and (crs or given.crs) and not is_geographic(crs or given.crs):
+        raise ValueError(f"crs: latitudes and longitudes are not of {crs or given.crs}")
+    if "stddev" in value or given.covariances is None:
+        stddev = values.parse_stddev(value, given.names, "image", partly=given.covariances is not None)
+        covariances = stddev[:, :, None] ** 2 * np.eye(3)
+        if given.covariances is not None:
+            covariances = np.where(np.isnan(stddev[:, :1, None]), given.covariances, covariances)
+        notes = () if "stddev" in value else given.notes
+        given = given._replace(covariances=covariances, notes=notes)
+    return given._replace(crs=crs or given.crs)
+
+
+def _photos(problem: BundleProblem, where: str, folder: Path, strict: bool) -> Positions:
     if problem.labels is None:
         raise ValueError("photos: the problem does not name its images")
-    found = read_photos(path, names := problem.labels.names)
-    others = sorted({*names} - {*found.names})
-    leave_out(where, "photo", "{} without a position", others, strict)
+    names = problem.labels.names
+    found = read_photos(folder, names)
+    leave_out(where, "photo", "{} without a position", sorted({*names} - {*found.names}), strict)
     return found

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem.checks import SHOWN
+from jaxba.problem.image_names import named_images
 from jaxba.problem.losses import Loss
 from jaxba.problem.row_data import is_positive
 
@@ -29,8 +30,8 @@ def meant(items: Sequence[str], names: Container[str] = ()) -> list[Any]:
     """What items of the file mean: of each text a name if there is such a one, else an id or a position.
 
     Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules."""
-    plain = lambda one: one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
-    return [int(one) if plain(one) else one for one in items]
+    numbers = {item for item in items if re.fullmatch(r"0|[1-9]\d*", item, re.ASCII) and item not in names}
+    return [int(item) if item in numbers else item for item in items]
 
 
 def parse_items(value: Any, what: str) -> list[str]:
@@ -106,20 +107,35 @@ def _written(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
-def parse_stddev(value: dict[str, Any], images: list[str], kind: str) -> Float[np.ndarray, "n 3"]:
-    """Standard deviations of each image or point; 1 if nothing is said. Raises ValueError: others; one line."""
-    value = value.get("stddev", "1")
-    if isinstance(value, list) and (len(value) != 3 or any(isinstance(one, list) for one in value)):
-        if len(value) != len(images):
-            what = f"must be one number, three, or one or three for each of {len(images)} {kind}s"
-            raise ValueError(f"stddev: {what}, not {len(value)} values")
-        value = dict(zip(images, value, strict=True))
-    if not isinstance(value, dict):
-        return np.tile(parse_deviations("stddev", value), (len(images), 1))
-    missing = [image for image in images if image not in value]
-    if missing:
+def parse_stddev(
+    value: dict[str, Any], names: list[str], kind: str, *, partly: bool = False
+) -> Float[np.ndarray, "n 3"]:
+    """Standard deviations of images or points; 1 if nothing is said.
+
+    Args:
+        value: the mapping that may have the key `stddev`.
+        names: what it calls the images or points.
+        kind: which they are.
+        partly: whether some may be missing, which are NaN.
+
+    Raises:
+        ValueError: something else; one line."""
+    given = value.get("stddev", "1")
+    if isinstance(given, list) and (len(given) != 3 or any(isinstance(item, list) for item in given)):
+        if len(given) != len(names):
+            what = f"must be one number, three, or one or three for each of {len(names)} {kind}s"
+            raise ValueError(f"stddev: {what}, not {len(given)} values")
+        return np.stack([parse_deviations(f"stddev: {name}", item) for name, item in zip(names, given, strict=True)])
+    if not isinstance(given, dict):
+        return np.tile(parse_deviations("stddev", given), (len(names), 1))
+    if kind == "image":
+        means = named_images(given, names).positions
+        given = {names[means[key]] if key in means else key: item for key, item in given.items()}
+    missing = [name for name in names if name not in given]
+    if missing and not (partly and len(missing) < len(names)):
         raise ValueError(f"stddev: missing for {names_of(missing)}")
-    return np.stack([parse_deviations(f"stddev: {image}", value[image]) for image in images])
+    none = np.full(3, np.nan)
+    return np.stack([parse_deviations(f"stddev: {name}", given[name]) if name in given else none for name in names])
 
 
 def parse_deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:

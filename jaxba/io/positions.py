@@ -2,106 +2,31 @@
 
 from __future__ import annotations
 
-import csv
-import re
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import closing
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name, reason
 from jaxba.io.json_records import Record, read_json
 from jaxba.io.nerfstudio import IMAGES
-from jaxba.io.text import finite_numbers
+from jaxba.io.position_tables import WGS84, Positions, read_table, without_accuracy
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
-
-WGS84 = "EPSG:4326"  # what longitudes and latitudes are of, if nothing else is said
-
-COLUMNS = {
-    "name": ("image", "filename", "file", "label", "name", "photo", "imagename", "imagefile", "sourcefile"),
-    "x": ("x", "easting", "east", "e"),
-    "y": ("y", "northing", "north", "n"),
-    "longitude": ("longitude", "lon", "lng", "long", "gpslongitude", "xlongitude"),
-    "latitude": ("latitude", "lat", "gpslatitude", "ylatitude"),
-    "height": ("z", "height", "altitude", "alt", "elevation", "up", "gpsaltitude", "zaltitude", "ellipsoidalheight"),
-    "sx": ("sigmax", "sx", "accuracyx", "xaccuracy", "stdx", "stddevx", "sigmaeast", "stdlon", "rtkstdlon"),
-    "sy": ("sigmay", "sy", "accuracyy", "yaccuracy", "stdy", "stddevy", "sigmanorth", "stdlat", "rtkstdlat"),
-    "sxy": ("accuracyhorizontal", "horizontalaccuracy", "accuracyxy", "xyaccuracy", "hacc", "sigmah", "horizontal"),
-    "sz": (
-        *("accuracyvertical", "verticalaccuracy", "accuracyz", "zaccuracy", "vacc", "sigmav", "vertical", "sigmaup"),
-        *("sigmaz", "sz", "stdz", "stddevz", "stdhgt", "rtkstdhgt"),
-    ),
-    "s": ("accuracy", "sigma", "stddev", "std", "s"),
-}
-"""Columns of a table by their names, in letters alone and without units in brackets."""
-
-DEVIATIONS = (("sx", "sy", "sz"), ("sxy", "sxy", "sz"), ("s", "s", "s"))  # columns that say how accurate a position is
+from jaxba.problem.image_names import named_images
 
 GPS, ABOVE_SEA = 0x8825, 5
 """Block of the EXIF data of a photo with its position, and the field that is 1 below sea level."""
 
 
-class Positions(NamedTuple):
-    """Positions of images."""
-
-    names: list[str]
-    places: Float[np.ndarray, "n 3"]  # x, y, z, or longitude and latitude (degrees) and height (metres)
-    covariances: Float[np.ndarray, "n 3 3"] | None  # along x, y and z, or metres east, north and up; None: not known
-    crs: str  # coordinate system; empty: that of the scene
-
-
-def read_table(path: StrPath) -> Positions:
-    """Reads a table with a line of names (`COLUMNS`), between commas, semicolons or tabs. Lines without a place are
-    left out. Raises ProblemError: it cannot be read, or a column is missing; one line that names the file and line."""
-    file, lines = display_name(path), read_characters(path).split("\n")
-    found = next((at for at, line in enumerate(lines) if len(_named(_cells(line))) > 2), None)
-    if found is None:
-        raise ProblemError(f"{file}: no line names the columns, such as image, latitude, longitude, altitude")
-    column = _named(_cells(lines[found]))
-    geographic = {"longitude", "latitude"} <= column.keys()
-    axes = ("longitude", "latitude", "height") if geographic else ("x", "y", "height")
-    if missing := [one for one in ("name", *axes) if one not in column]:
-        raise ProblemError(f"{file} line {found + 1}: there is no column {missing[0]}")
-    deviations = next((one for one in DEVIATIONS if column.keys() >= set(one)), ())
-    names, rows = [], []
-    for number, line in enumerate(lines[found + 1 :], found + 2):
-        cells = _cells(line, lines[found])
-        if line.startswith("#") or not any(cells):
-            continue
-        if len(cells) <= max(column[one] for one in ("name", *axes, *deviations)):
-            raise ProblemError(f"{file} line {number}: has {len(cells)} columns, fewer than the line of names")
-        if any(cells[column[one]] for one in axes):
-            names.append(cells[column["name"]])
-            wanted = (*axes, *deviations)
-            rows.append(finite_numbers([cells[column[one]] for one in wanted], wanted, f"{file} line {number}"))
-            if min(rows[-1][3:], default=1.0) <= 0:
-                raise ProblemError(f"{file} line {number}: an accuracy is not positive")
-    if not rows:
-        raise ProblemError(f"{file}: has no positions")
-    table = np.array(rows)
-    covariances = table[:, 3:, None] ** 2 * np.eye(3) if deviations else None
-    return Positions(names, table[:, :3], covariances, WGS84 if geographic else "")
-
-
-def _cells(line: str, of: str | None = None) -> list[str]:
-    """The cells of a line, between what separates those of `of`."""
-    of = line if of is None else of
-    mark = max(",;\t", key=of.count)
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=mark), [])]
-
-
-def _named(cells: Sequence[str]) -> dict[str, int]:
-    """The column of each thing that a line of names has."""
-    known = {name: what for what, names in COLUMNS.items() for name in names}
-    plain = [re.sub(r"[^a-z]", "", re.sub(r"[\[(].*", "", cell.lower())) for cell in cells]
-    return {known[name]: at for at, name in reversed([*enumerate(plain)]) if name in known}
+def read_file(path: StrPath, crs_is_geographic: bool | None = None) -> Positions:
+    """Positions of nerfstudio's file, or of a table; the rest is as for `read_table`."""
+    return read_transforms(path) if Path(path).suffix == ".json" else read_table(path, crs_is_geographic)
 
 
 def read_database(path: StrPath) -> Positions:
@@ -114,9 +39,18 @@ def read_database(path: StrPath) -> Positions:
     if len(systems) != 1:
         raise ProblemError(f"{file}: has {'positions of different coordinate systems' if systems else 'no positions'}")
     covariances = np.array([_numbers(rows[at][2], 9) for at in kept]).reshape(-1, 3, 3)
-    known, geographic = np.isfinite(covariances).all(), systems == {0}
+    names = [rows[at][0] for at in kept]
+    geographic = systems == {0}
     places = places[kept][:, [1, 0, 2]] if geographic else places[kept]
-    return Positions([rows[at][0] for at in kept], places, covariances if known else None, WGS84 if geographic else "")
+    known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    known[known] = np.linalg.eigvalsh(covariances[known])[:, 0] > 0
+    notes = ()
+    if known.any() and not known.all():
+        largest = np.argmax(np.where(known, np.trace(covariances, axis1=1, axis2=2), -np.inf))
+        covariances[~known] = covariances[largest]
+        notes = (without_accuracy([names[at] for at in np.flatnonzero(~known)], file),)
+    crs = WGS84 if geographic else ""
+    return Positions(names, places, covariances if known.any() else None, crs, notes=notes, degrees=geographic)
 
 
 def read_gravity(path: StrPath) -> dict[str, Float[np.ndarray, "3"]]:
@@ -173,24 +107,35 @@ def _matrix(record: Record) -> Float[np.ndarray, "3 4"]:
 
 
 def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:
-    """Reads the GPS position of each photo of a folder that has one. Raises ProblemError: none has; one line."""
-    from PIL import Image
-
+    """Reads the GPS position of each photo of a folder that has one, by the names of images, which photos may have in
+    another case or with another ending. Raises ProblemError: none has; one line."""
     found, places = [], []
+    names = list(names)
+    lost = [name for name in names if not Path(folder, name).is_file()]
+    files = sorted(file.relative_to(folder).as_posix() for file in Path(folder).rglob("*") if lost and file.is_file())
+    others = {name: files[at] for name, at in named_images(lost, files).positions.items()}
     for name in names:
-        try:
-            with Image.open(Path(folder, name)) as image:
-                gps = image.getexif().get_ifd(GPS)
-            below = gps.get(ABOVE_SEA, 0) in (1, b"\x01")
-            place = [_degrees(gps[4], gps[3]), _degrees(gps[2], gps[1]), float(gps[6]) * (-1.0 if below else 1.0)]
-        except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, SyntaxError):
-            continue  # not there, no photo, or one without a place
-        if np.isfinite(place).all():
+        place = _place_of(Path(folder, others.get(name, name)))
+        if place is not None:
             found.append(name)
             places.append(place)
     if not found:
         raise ProblemError(f"{display_name(folder)}: no photo of the model there has a GPS position")
-    return Positions(found, np.array(places), None, WGS84)
+    return Positions(found, np.array(places), None, WGS84, degrees=True)
+
+
+def _place_of(photo: Path) -> list[float] | None:
+    """Longitude, latitude and height of a photo; None: it is not there, is no photo, or has no place."""
+    from PIL import Image
+
+    try:
+        with Image.open(photo) as image:
+            gps = image.getexif().get_ifd(GPS)
+        below = gps.get(ABOVE_SEA, 0) in (1, b"\x01")
+        place = [_degrees(gps[4], gps[3]), _degrees(gps[2], gps[1]), float(gps[6]) * (-1.0 if below else 1.0)]
+    except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, SyntaxError):
+        return None
+    return place if np.isfinite(place).all() else None
 
 
 def _degrees(parts: Any, side: str) -> float:

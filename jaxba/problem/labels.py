@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int, Integer
 
+from jaxba.problem.image_names import named_images
 from jaxba.typing import ArrayRecord
 
 Part = Literal["image", "lens", "point"]
@@ -51,16 +52,20 @@ class Labels(ArrayRecord):
         return self.marks[number] if number >= 0 else ""
 
     def positions(self, kind: Part, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
-        """Positions of parts by id, of images also by name. Raises ValueError: there is no such part; one line."""
+        """Positions of parts by id, of images also by name, as `named_images` understands it. Raises ValueError: there
+        is no such part, or there are several; one line."""
         ids = {"image": self.images, "lens": self.lenses, "point": self.points}[kind]
         known: dict[int | str, int] = {number: at for at, number in enumerate(ids.tolist())}
-        if kind == "image":
-            known |= {name: at for at, name in enumerate(self.names)}
         wanted = list(wanted)
+        named = named_images([one for one in wanted if isinstance(one, str) and kind == "image"], self.names)
+        known |= named.positions
         missing = [one for one in wanted if isinstance(one, bool) or one not in known]
         if missing:
             more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
-            raise ValueError(f"there is no {'camera' if kind == 'lens' else kind} {missing[0]!r}{more}")
+            example = f"; there is {self.names[0]!r}" if isinstance(missing[0], str) and kind == "image" else ""
+            doubt = named.doubts.get(str(missing[0]), "")
+            what = f"there is no {'camera' if kind == 'lens' else kind} {missing[0]!r}{more}"
+            raise ValueError(doubt or what + example)
         return np.array([known[one] for one in wanted], np.int64)
 
 

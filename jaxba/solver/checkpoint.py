@@ -65,14 +65,11 @@ class Checkpoint:
         if not os.path.isdir(os.path.dirname(os.path.abspath(path))):
             raise ProblemError(f"cannot write {path}: its folder is missing")
         options = replace(options, max_iterations=1, tolerances=Tolerances(), within=0.0)
-        numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
         self._path, self._last, self._labels = path, time.monotonic(), problem.labels
         self._start, self._tree = jax.tree.flatten(problem)
         losses = options.loss, *(rows.loss for rows in problem.residuals.rows)
         own = [jax.make_jaxpr(loss.rho)(np.zeros(1, np.float32)) for loss in losses if callable(loss.rho)]
-        # functions by what they compute: each process has them at other addresses
-        settings = re.sub(" at 0x[0-9a-f]+", "", repr((policy, numbers, options, self._tree, own)))
-        found = hashlib.blake2b(settings.encode())
+        found = hashlib.blake2b(settings_text(policy, options, self._tree, own).encode())
         for leaf in self._start:
             found.update(np.ascontiguousarray(leaf).data)
         self._key = found.hexdigest()
@@ -118,6 +115,13 @@ class Checkpoint:
             text = f"cannot write {self._path}: {error.strerror or error}; the solve goes on"
             warnings.warn(text, ProblemWarning, stacklevel=2)
         self._last = time.monotonic()
+
+
+def settings_text(policy: Any, options: SolveOptions, *more: Any) -> str:
+    """What determines a solve besides its problem, the same in every process."""
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
+    # functions by what they compute: each process has them at other addresses
+    return re.sub(" at 0x[0-9a-f]+", "", repr((policy, numbers, options, *more)))
 
 
 def _numbered(found: dict[str, np.ndarray], name: str) -> list[np.ndarray]:

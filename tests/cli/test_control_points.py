@@ -119,6 +119,7 @@ def test_mistakes_from_python_are_one_line_that_names_the_key(constraints, messa
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.filterwarnings("ignore:.* all are check points, and nothing moves the scene:jaxba.ProblemWarning")
 @pytest.mark.parametrize("refined", [False, True])
 def test_a_mark_with_the_pixels_of_a_point_is_where_that_is(refined, solved, tmp_path):
     """With BAL's lenses, whose pixels count from the principal point, and with COLMAP's."""
@@ -234,7 +235,7 @@ def test_wrong_matches_and_clicks_are_rejected_and_check_points_are_as_far_off_a
     [
         ("EPSG:32632\n", "", "gcp_list.txt: has no points"),
         ("1 2 3 4 5 a.jpg\n1 2 3 4 5 b.jpg\n", "", "gcp_list.txt line 1: is no coordinate system, such as EPSG:32632"),
-        ("# c\nlocal\n1 2 3 4 a.jpg\n", "", "gcp_list.txt line 3: has 5 words, not x y z px py image [name]"),
+        ("# c\nlocal\n1 2 3 a.jpg\n", "", "gcp_list.txt line 3: has 4 words, not x y z px py image [name]"),
         ("local\n1 2 3 4 x a.jpg\n", "", "gcp_list.txt line 2: 'x' is not a number (pixel y)"),
         ("local\n1 2 3 4 5 a.jpg g\n1 2 4 4 5 b.jpg g\n", "", "gcp_list.txt line 3: g has another place than before"),
         ("local\n1 2 3 4 5 a.jpg g\n1 2 3 4 6 a.jpg g\n", "", "gcp_list.txt line 3: g is in a.jpg twice"),
@@ -254,6 +255,39 @@ def test_mistakes_are_one_line_with_file_and_line(text, more, message, block, tm
     assert message in str(caught.value)
     assert "control_points: " in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_check_points_alone_are_not_compared_with_places_of_another_frame(block, tmp_path):
+    """The report has no differences, and no note says that the scene is anywhere."""
+    names = ", ".join(f"gcp{at}" for at in range(CONTROLS + CHECKS))
+    folder = block.folder / "model"
+    for line, alone in (("WGS84 UTM 32N", True), ("local", False)):
+        text = (block.folder / "gcp_list.txt").read_text().replace("WGS84 UTM 32N", line)
+        (tmp_path / "gcp_list.txt").write_text(text)
+        (tmp_path / "c.yaml").write_text(f"control_points: {{file: gcp_list.txt, check: [{names}]}}\n")
+        with pytest.warns(ProblemWarning, match="all are check points") as notes:
+            found = jaxba.survey(jaxba.read_colmap(folder), tmp_path / "c.yaml", model=folder)
+        assert not any("the scene is in" in str(note.message) for note in notes)
+        assert found.marks is not None
+        assert np.isnan(found.marks.places).all() == alone
+        assert not found.problem.residuals
+
+
+def test_what_lacks_of_control_points_leaves_out_these_alone(block, tmp_path):
+    lines = (block.folder / "gcp_list.txt").read_text().split("\n")[:-1]
+    changed = [lines[0]]
+    for line in lines[1:]:
+        east, north, up, rest = line.split(" ", 3)
+        place = {"gcp1": f"{east} {north}", "gcp2": "- - -"}.get(line.split()[-1], f"{east} {north} {up}")
+        changed.append(f"{place} {rest}".replace("image0", r"D:\Flight\IMAGE0").replace(".jpg", ".JPG"))
+    (tmp_path / "gcp_list.txt").write_text("\n".join(changed))
+    constraints = {"control_points": {"file": tmp_path / "gcp_list.txt"}}
+    folder = block.folder / "model"
+    with pytest.warns(ProblemWarning) as notes:
+        found = jaxba.survey(jaxba.read_colmap(folder), constraints, model=folder)
+    assert any("left out 2 points without a place or height: gcp1, gcp2" in str(note.message) for note in notes)
+    assert found.marks is not None
+    assert set(found.marks.names) == {f"gcp{at}" for at in range(CONTROLS + CHECKS)} - {"gcp1", "gcp2"}
 
 
 def test_points_of_other_images_are_left_out(block, tmp_path):

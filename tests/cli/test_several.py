@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxba
-from jaxba.cli import common, several
+from jaxba.cli import common, several, solve
 from jaxba.cli.several import COSTS
 from jaxba.cli.solve import run
 
@@ -82,14 +82,88 @@ def test_a_run_goes_on_where_it_was_also_after_a_line_that_was_cut(problems, tmp
     assert "--resume" in capsys.readouterr().err
     costs = output / COSTS
     costs.write_bytes(costs.read_bytes()[:-20])  # killed while it wrote the second line
-    (output / first[0]["problem"]).unlink()  # to see that it is not solved again
+    solution = output / first[0]["problem"]
+    written = solution.stat().st_mtime_ns
     assert run([*paths, "--output", str(output), "--resume", *ASKED]) == 0
     assert "1 of 3 are there already" in capsys.readouterr().out
     found = rows(output)
     assert [row["problem"] for row in found] == [f"scene-{seed}.txt.gz" for seed in range(3)]
     assert found[0] == first[0]
     assert found[1]["final_cost"]
-    assert sorted(one.name for one in output.iterdir()) == [COSTS, "scene-1.txt.gz", "scene-2.txt.gz"]
+    assert solution.stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["--loss", "cauchy"],
+        ["--policy", "nielsen"],
+        ["--ftol", "1e-3"],
+        ["--intrinsics", "fixed"],
+        ["--constant", "focal"],
+        ["--max-iterations", "6"],
+    ],
+)
+def test_a_run_does_not_go_on_by_other_options(problems, tmp_path, more, capsys):
+    output = tmp_path / "solved"
+    assert run([str(problems), "--output", str(output), *ASKED]) == 0
+    content = (output / COSTS).read_bytes()
+    capsys.readouterr()
+    assert run([str(problems), "--output", str(output), "--resume", *ASKED, *more]) == 2
+    error = capsys.readouterr().err
+    assert "other options, constraints or policy" in error
+    assert error.count("\n") == 1
+    assert (output / COSTS).read_bytes() == content
+
+
+def test_a_run_does_not_go_on_by_constraints_whose_files_have_changed(problems, tmp_path, capsys):
+    output = tmp_path / "solved"
+    constraints, log = tmp_path / "constraints.yaml", tmp_path / "log.csv"
+    constraints.write_text("constant_points: [3]\nposition_priors: {file: log.csv, stddev: 5}\n")
+    positions = [f"{number},{number % 3},{number},0.{number}" for number in range(6)]
+    log.write_text("\n".join(["image,x,y,z", *positions]) + "\n")
+    asked = [str(problems), "--output", str(output), "--constraints", str(constraints), "--max-iterations", "0"]
+    assert run(asked) == 0
+    assert run([*asked, "--resume", "--compilation", "auto"]) == 0
+    assert "3 of 3 are there already" in capsys.readouterr().out
+    for file in (log, constraints):
+        content = file.read_text()
+        file.write_text(content.replace("3", "4"))
+        assert run([*asked, "--resume"]) == 2
+        assert "other options, constraints or policy" in capsys.readouterr().err
+        file.write_text(content)
+
+
+def test_what_has_changed_and_what_is_lost_is_solved_anew(problems, tmp_path, capsys):
+    output = tmp_path / "solved"
+    assert run([str(problems), "--output", str(output), *ASKED]) == 0
+    before = rows(output)
+    paths = sorted(problems.iterdir())
+    jaxba.write_problem(jaxba.random_scene(jaxba.scene_like("tiny"), 9), paths[0])
+    (output / before[1]["problem"]).unlink()
+    os.utime(paths[2])  # touched, but not changed
+    capsys.readouterr()
+    assert run([str(problems), "--output", str(output), "--resume", *ASKED]) == 0
+    told = capsys.readouterr().out
+    assert "1 of 3 are there already" in told
+    assert "solved anew: 1 whose files have changed, 1 whose solutions are not there" in told
+    after = {row["problem"]: row for row in rows(output)}
+    assert after["scene-2.txt.gz"] == before[2]
+    assert after["scene-1.txt.gz"] == before[1]
+    assert after["scene-0.txt.gz"]["initial_cost"] != before[0]["initial_cost"]
+    assert (output / "scene-1.txt.gz").exists()
+
+
+def test_an_error_that_nobody_expects_comes_after_the_solutions_of_what_was_read(problems, tmp_path, monkeypatch):
+    def read(args, path):
+        if path.endswith("scene-2.txt.gz"):
+            raise RuntimeError("unexpected")
+        return jaxba.read_problem(path)
+
+    monkeypatch.setattr(solve, "_one_of_several", read)
+    with pytest.raises(RuntimeError, match="unexpected"):
+        run([str(problems), "--output", str(tmp_path / "solved"), *ASKED])
+    assert [bool(row["final_cost"]) for row in rows(tmp_path / "solved")] == [True, True]
 
 
 def test_a_run_goes_on_with_names_of_any_bytes_and_costs_that_an_editor_or_a_crash_has_touched(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sqlite3
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,131 @@ def test_images_are_found_by_the_names_of_their_files(scene, tmp_path):
     with pytest.warns(ProblemWarning):
         found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
     assert found.residuals.rows[0].index[0].tolist() == list(range(6))
+
+
+def surveyed(problem: jaxba.BundleProblem, **constraints) -> tuple[jaxba.BundleProblem, list[str]]:
+    """A problem with constraints, and the notes."""
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        found = jaxba.survey(problem, constraints).problem
+    return found, [str(note.message) for note in notes]
+
+
+def deviations(problem: jaxba.BundleProblem) -> np.ndarray:
+    """Standard deviations of positions."""
+    (rows,) = problem.residuals.rows
+    return 1 / np.diagonal(np.asarray(rows.data[1]), axis1=1, axis2=2)
+
+
+@pytest.mark.parametrize("prefix", ["C:\\flights\\07\\", "/data/flights/", "other/"])
+@pytest.mark.parametrize("case", [str.upper, str.lower])
+def test_images_are_found_by_paths_of_any_system_and_case(prefix, case, scene, tmp_path):
+    _, problem, places = scene
+    rows = [
+        f"{prefix}{case(name)},{','.join(map(repr, place))}"
+        for name, place in zip(problem.labels.names, places.tolist(), strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["image,lat,lon,alt", *rows[::-1]]))
+    found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv", "stddev": 0.5})
+    assert found.residuals.rows[0].index[0].tolist() == [5, 4, 3, 2, 1, 0]
+    assert len(notes) == 1
+
+
+def test_names_that_are_not_there_or_not_clear_are_noted_beside_one_that_is(scene, tmp_path):
+    _, problem, places = scene
+    labels = problem.labels
+    names = ("a/IMG_1.jpg", "b/IMG_1.jpg", *(f"a/{name}" for name in labels.names[2:]))
+    problem = problem.replace(labels=Labels(names, labels.images, labels.lenses, labels.points))
+    rows = [
+        f"{name},{','.join(map(repr, place))}"
+        for name, place in zip(("IMG_1.jpg", "gone.jpg", *names[2:]), places.tolist(), strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["image,lat,lon,alt", *rows]))
+    found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv"})
+    assert found.residuals.rows[0].index[0].tolist() == [2, 3, 4, 5]
+    assert notes[0].endswith(
+        "left out positions of 1 image that the problem does not have: gone.jpg; it has a/IMG_1.jpg"
+    )
+    assert "positions of 1 image whose names are not clear: IMG_1.jpg; a/IMG_1.jpg and b/IMG_1.jpg may both" in notes[1]
+
+
+@pytest.mark.parametrize("source", ["file", "database", "photos", "positions"])
+def test_images_without_a_fix_are_left_out_and_do_not_move_the_frame(source, scene, tmp_path):
+    _, problem, places = scene
+    names = problem.labels.names
+    places = places.copy()
+    places[1] = 0
+    places[4] = [0, 0, 120]
+    write_log(tmp_path / "log.csv", problem, places)
+    write_database(tmp_path / "d.db", problem, places)
+    write_photos(tmp_path / "images", problem, places)
+    inline = {name: place for name, place in zip(names, places.tolist(), strict=True)}
+    value = {"file": tmp_path / "log.csv", "database": tmp_path / "d.db", "photos": tmp_path / "images"}
+    given = {source: value.get(source, inline), "stddev": 0.5} | ({} if source in value else {"crs": "EPSG:4326"})
+    found, notes = surveyed(problem, position_priors=given)
+    assert found.residuals.rows[0].index[0].tolist() == [0, 2, 3, 5]
+    assert any(f"left out positions of 2 images without a fix: {names[1]}, {names[4]}" in note for note in notes)
+    assert np.abs(np.asarray(found.residuals.rows[0].data[0])).max() < 1000
+    with pytest.raises(ProblemError, match=r"position_priors: .*positions of .* image"):
+        jaxba.survey(problem, {"position_priors": given}, strict=True)
+
+
+def test_accuracies_of_a_table_that_are_not_all_there_count(scene, tmp_path):
+    _, problem, places = scene
+    rows = [f"{name},{a!r},{b!r},{c!r}" for name, (a, b, c) in zip(problem.labels.names, places.tolist(), strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["image,lat,lon,alt,hacc", *(f"{row},0.02" for row in rows)]))
+    found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv"})
+    assert any("no accuracy of heights: they get 2 times the horizontal one" in note for note in notes)
+    np.testing.assert_allclose(deviations(found), np.tile([0.02, 0.02, 0.04], (6, 1)))
+    found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv", "stddev": 0.5})
+    assert not any("accuracy" in note for note in notes)
+    mapping = {problem.labels.names[0].upper(): 0.25}
+    found, _ = surveyed(problem, position_priors={"file": tmp_path / "log.csv", "stddev": mapping})
+    np.testing.assert_allclose(deviations(found)[:2], [[0.25] * 3, [0.02, 0.02, 0.04]])
+    base = tmp_path / "d.db"
+    write_database(base, problem, places)
+    with sqlite3.connect(base) as connection:
+        for image, covariance in ((2, np.full((3, 3), np.nan)), (3, np.eye(3)), (4, np.zeros((3, 3)))):
+            connection.execute(
+                "UPDATE pose_priors SET position_covariance = ? WHERE corr_data_id = ?", (covariance.tobytes(), image)
+            )
+    connection.close()
+    found, notes = surveyed(problem, position_priors={"database": base})
+    assert any(
+        f"no accuracy of 2 images, which get the largest of the others: {problem.labels.names[2]}" in note
+        for note in notes
+    )
+    np.testing.assert_allclose(deviations(found)[:, 0], [0.05, 0.05, 1, 1, 1, 0.05])
+
+
+def test_an_image_with_two_positions_has_none(scene, tmp_path):
+    _, problem, places = scene
+    rows = [f"{name},{a!r},{b!r},{c!r}" for name, (a, b, c) in zip(problem.labels.names, places.tolist(), strict=True)]
+    other = f"{rows[1].rpartition(',')[0]},{float(places[1, 2]) + 0.5!r}"
+    (tmp_path / "log.csv").write_text("\n".join(["image,lat,lon,alt", *rows, rows[0], other]))
+    found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv"})
+    assert found.residuals.rows[0].index[0].tolist() == [0, 2, 3, 4, 5]
+    name = problem.labels.names[1]
+    assert any(
+        note.endswith(f"positions of 1 image with other ones in another row, in 2 rows: {name}") for note in notes
+    )
+
+
+def test_a_coordinate_system_of_the_scene_counts_for_positions_without_one_or_is_noted(scene, tmp_path):
+    _, problem, places = scene
+    east, north = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*places.T[:2])
+    rows = [
+        f"{name};{x:.4f};{y:.4f};{z:.4f}".replace(".", ",").replace(",jpg", ".jpg")
+        for name, x, y, z in zip(problem.labels.names, east, north, places[:, 2], strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["Label;X/Easting;Y/Northing;Z/Altitude", *rows]))
+    found, notes = surveyed(problem, crs="EPSG:32632", position_priors={"file": tmp_path / "log.csv"})
+    assert any("positions are taken as of EPSG:32632" in note for note in notes)
+    np.testing.assert_allclose(found.residuals.rows[0].data[0][:, 0], east, atol=1e-3)
+    _, notes = surveyed(problem, crs="EPSG:32632", constant_poses=[problem.labels.names[0]])
+    assert notes == [
+        "constraints: crs: nothing moves the scene there: it needs position_priors or a file of control_points"
+    ]
 
 
 def test_the_written_model_stays_in_metres(scene, tmp_path, capsys):

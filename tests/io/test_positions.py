@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import sqlite3
 import sys
+import warnings
 
 import numpy as np
+import pyproj
 import pytest
 from PIL import Image
 
-from jaxba import ProblemError
-from jaxba.io.geodesy import Frame, in_frame, projected
+from jaxba import ProblemError, ProblemWarning
+from jaxba.io.geodesy import Frame, in_frame, projected, system_of
 from jaxba.io.positions import read_database, read_photos, read_table, read_transforms
 
 PLACES = np.array([[8.5, 47.3, 500.0], [8.51, 47.31, 620.0], [8.52, 47.29, 480.0]])
@@ -36,7 +38,7 @@ def geocentric(places: np.ndarray) -> np.ndarray:
 def test_east_north_and_up_are_those_of_the_textbook():
     found, frame = in_frame(PLACES, "EPSG:4326")
     middle = np.array(frame.origin)
-    assert np.abs(found.mean(axis=0)).max() < 0.5
+    np.testing.assert_allclose(middle, np.median(PLACES, axis=0), atol=1e-3)
     step = np.eye(3) * [1e-6, 1e-6, 1e-2]
     axes = geocentric(middle + step) - geocentric(middle - step)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -50,6 +52,72 @@ def test_a_projected_system_is_a_frame_and_goes_back():
     assert abs(found[0, 0] - (500_000 - 0.5 * np.cos(np.radians(47.3)) * 111_320 * 0.9996)) < 100  # east of 9 degrees
     local, own = in_frame(PLACES, "EPSG:4326")
     np.testing.assert_allclose(in_frame(found, "EPSG:32632", own)[0], local, atol=1e-6)
+
+
+US_FOOT = 1200 / 3937
+OHIO = np.array([[2_286_175.0, 360_404.0, 812.5], [2_286_300.0, 360_500.0, 900.0]])
+"""Eastings, northings and heights of EPSG:3734, in US survey feet."""
+
+
+@pytest.mark.parametrize(
+    ("crs", "units", "unit", "said"),
+    [
+        ("EPSG:3734", (np.nan, np.nan), US_FOOT, ["log: heights are taken in the unit of EPSG:3734: US survey foot"]),
+        ("EPSG:3734", (0.3048, 0.3048), US_FOOT, []),  # a file that says feet means those of its system
+        ("EPSG:3734", (np.nan, 1.0), 1.0, []),
+        ("EPSG:32617", (np.nan, np.nan), 1.0, []),
+        ("EPSG:32617", (np.nan, 0.3048), 0.3048, []),
+    ],
+)
+def test_heights_are_in_the_unit_of_their_system_or_file(crs, units, unit, said):
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        found, _ = in_frame(OHIO, crs, projected("EPSG:32617"), units=units, where="log")
+    assert [str(note.message) for note in notes] == said
+    np.testing.assert_allclose(found[:, 2], unit * OHIO[:, 2], rtol=1e-9)
+    flat = pyproj.Transformer.from_crs(crs, "EPSG:32617", always_xy=True).transform(*OHIO[:, :2].T)
+    np.testing.assert_allclose(found[:, :2], np.stack(flat, axis=1), atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:heights. heights are taken in the unit of EPSG.3734:jaxba.ProblemWarning")
+def test_heights_above_a_geoid_without_its_grid_stay_and_are_not_mixed_with_others():
+    """PROJ would take them for heights above the ellipsoid, without a word."""
+    note = r"above North American Vertical Datum 1988 and stay as they are: the grid .*\.tif is not installed"
+    with pytest.warns(ProblemWarning, match=note):
+        found, frame = in_frame(OHIO * [1, 1, US_FOOT], "EPSG:3734+5703", projected("EPSG:32617"))
+    np.testing.assert_allclose(found[:, 2], US_FOOT * OHIO[:, 2])
+    with pytest.warns(ProblemWarning, match=note):  # of which there are two: it is in feet, too
+        np.testing.assert_allclose(in_frame(OHIO, "EPSG:3734+6360", frame)[0], found, atol=1e-6)
+    with pytest.raises(ValueError, match="EPSG:32617 are above the ellipsoid, those of the scene above North American"):
+        in_frame(found, "EPSG:32617", frame)
+    _, frame = in_frame(found, "EPSG:32617")
+    with pytest.raises(ValueError, match=r"those of the scene above the ellipsoid, and the grid .*\.tif is not"):
+        in_frame(found, "EPSG:32617+5773", frame)
+
+
+def test_a_wrong_place_does_not_move_the_frame_far():
+    """Nor do places on both sides of the date line."""
+    _, frame = in_frame(np.vstack([PLACES, PLACES + 1e-3, [[0.1, 0.1, 0.0]]]), "EPSG:4326")
+    np.testing.assert_allclose(frame.origin[:2], PLACES[:, :2].mean(axis=0), atol=0.02)
+    _, frame = in_frame(np.array([[179.99, 10, 5], [-179.99, 10, 5], [-179.98, 10, 5]]), "EPSG:4326")
+    assert abs(frame.origin[0]) == pytest.approx(179.99)
+
+
+@pytest.mark.parametrize(
+    ("line", "crs"),
+    [
+        ("EPSG:32633", "EPSG:32633"),
+        ("WGS84 UTM 32N", "EPSG:32632"),
+        ("WGS 84 / UTM zone 7S", "EPSG:32707"),
+        ("#CoordinateSystem: WGS84 UTM 32N", "EPSG:32632"),
+        ("+proj=utm +zone=32 +units=us-ft", "+proj=utm +zone=32 +units=us-ft"),
+        ("# a comment", ""),
+        ("image,x,y,z", ""),
+        ('#CoordinateSystem: LOCAL_CS["Local Coordinates (m)"]', ""),
+    ],
+)
+def test_a_line_may_be_a_coordinate_system(line, crs):
+    assert system_of(line) == crs
 
 
 @pytest.mark.parametrize(
@@ -84,11 +152,12 @@ TABLES = {
 @pytest.mark.parametrize("table", TABLES)
 def test_flight_logs_are_tables_with_the_usual_names(table, tmp_path):
     (tmp_path / "log.csv").write_text(TABLES[table])
-    names, places, covariances, crs = read_table(tmp_path / "log.csv")
-    assert names == ["a.jpg", "b.jpg"]
-    assert (places == PLACES[:2]).all()
-    assert covariances is None
-    assert crs == "EPSG:4326"
+    found = read_table(tmp_path / "log.csv")
+    there = np.isfinite(found.places).all(axis=1)
+    assert [name for name, kept in zip(found.names, there, strict=True) if kept] == ["a.jpg", "b.jpg"]
+    assert (found.places[there] == PLACES[:2]).all()
+    assert found.covariances is None
+    assert found.crs == "EPSG:4326"
 
 
 @pytest.mark.parametrize(
@@ -101,10 +170,10 @@ def test_flight_logs_are_tables_with_the_usual_names(table, tmp_path):
 )
 def test_columns_of_accuracy_are_standard_deviations(columns, cells, variances, tmp_path):
     (tmp_path / "log.csv").write_text(f"image,easting,northing,z,{columns}\na.jpg,1,2,3,{cells}\n")
-    _, places, covariances, crs = read_table(tmp_path / "log.csv")
-    assert places.tolist() == [[1, 2, 3]]
-    assert covariances.tolist() == [np.diag(variances).tolist()]
-    assert crs == ""
+    found = read_table(tmp_path / "log.csv")
+    assert found.places.tolist() == [[1, 2, 3]]
+    assert found.covariances.tolist() == [np.diag(variances).tolist()]
+    assert (found.crs, found.notes) == ("", ())
 
 
 FRAME = '{"frames": [{"transform_matrix": %s}]}'
@@ -116,8 +185,7 @@ FRAME = '{"frames": [{"transform_matrix": %s}]}'
         ("log.csv", "a.jpg,1,2,3\n", ": no line names the columns"),
         ("log.csv", "image,lat,lon\na.jpg,1,2\n", " line 1: there is no column height"),
         ("log.csv", "image,lat,lon,alt\n\na.jpg,1,x,3\n", " line 3: 'x' is not a number (longitude)"),
-        ("log.csv", "image,lat,lon,alt\na.jpg,1,2\n", " line 2: has 3 columns, fewer than the line of names"),
-        ("log.csv", "image,lat,lon,alt,accuracy\na.jpg,1,2,3,0\n", " line 2: an accuracy is not positive"),
+        ("log.csv", "image,lat,lon,alt\n,1,2,3\n", " line 2: names no image"),
         ("log.csv", "image,lat,lon,alt\n", ": has no positions"),
         ("transforms.json", '{"frames": []}', ": has no frames"),
         ("transforms.json", '{"frames": [{"file_path": "a"}]}', ": frames[0] has no transform_matrix"),
@@ -148,7 +216,7 @@ def old_database(path, system: int = 0) -> None:
 
 def test_a_database_of_an_earlier_colmap_has_positions_by_image(tmp_path):
     old_database(tmp_path / "d.db")
-    names, places, covariances, crs = read_database(tmp_path / "d.db")
+    names, places, covariances, crs, *_ = read_database(tmp_path / "d.db")
     assert (names, covariances, crs) == (["a.jpg", "b.jpg"], None, "EPSG:4326")
     assert (places == PLACES[:2]).all()
 
@@ -179,7 +247,7 @@ def test_a_database_of_pycolmap_has_positions_and_covariances(geographic, tmp_pa
         prior.corr_data_id = base.read_image(number).data_id
         base.write_pose_prior(prior)
     base.close()
-    names, places, found, crs = read_database(tmp_path / "d.db")
+    names, places, found, crs, *_ = read_database(tmp_path / "d.db")
     assert (names, crs) == (["a.jpg", "b.jpg"], "EPSG:4326" if geographic else "")
     assert (places == PLACES[:2]).all()
     assert (found == covariances).all()
@@ -207,7 +275,7 @@ def test_photos_have_the_position_of_their_camera(tmp_path):
         exif = image.getexif()
         exif[0x8825] = gps
         image.save(tmp_path / name, exif=exif)
-    names, places, _, crs = read_photos(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
+    names, places, _, crs, *_ = read_photos(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
     assert (names, crs) == (["a.jpg", "b.jpg"], "EPSG:4326")
     np.testing.assert_allclose(places, [[-8.51, -47.3, 500], [8.51, 47.3, -2.5]], atol=1e-9)
     with pytest.raises(ProblemError, match="no photo of the model there has a GPS position"):
@@ -224,7 +292,7 @@ def test_positions_of_nerfstudio_are_in_the_world_before_its_transform(tmp_path)
     (file := tmp_path / "transforms.json").write_text(
         json.dumps({"frames": frames, "applied_transform": applied, "applied_scale": 2})
     )
-    names, places, covariances, crs = read_transforms(file)
+    names, places, covariances, crs, *_ = read_transforms(file)
     assert names == ["a.jpg", "left/b.jpg", "c.jpg"]
     np.testing.assert_array_equal(places, PLACES)
     assert (covariances, crs) == (None, "")

@@ -131,8 +131,9 @@ def known_motion(motion, *, value, sigma):
 
 @pytest.mark.slow
 def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iterations():
-    """Exact samples of a body on a spiral, priors at both ends, and starts off by 0.1 radians and a metre, as in GTSAM's
-    ImuFactorExample, which takes 5 iterations."""
+    """Exact samples of a body on a spiral, priors at both ends, and starts off by 0.1 radians and a metre.
+
+    It is the situation of GTSAM's ImuFactorExample, which takes 5 iterations."""
     rng = np.random.default_rng(0)
     seconds, rate = 12, 100
     spin = np.radians([30.0, -30.0, 0.0])  # in the body's frame, as its velocity

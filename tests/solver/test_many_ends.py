@@ -48,8 +48,7 @@ def test_a_stream_that_fails_gives_the_results_of_what_was_read_first(solved):
 
     results, found = solve_many(stream()), []
     with pytest.raises(KeyError, match="disk"):
-        for result in results:
-            found.append(result)
+        found.extend(results)
     assert [isinstance(result, Solution) for result in found] == [False, *[True] * 20]
     with pytest.raises(KeyError, match="disk"):
         list(solve_many(itertools.chain(map({}.__getitem__, ["disk"]), [scene])))
