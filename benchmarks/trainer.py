@@ -100,7 +100,7 @@ def peer(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
     loop, run = env.preset.loop, Run()
     model = SAC(
         "MlpPolicy",
-        ForStableBaselines(GymVectorGame(env)),
+        ForStableBaselines(GymVectorGame(env, "SameStep")),
         learning_starts=loop.warmup_steps,
         buffer_size=loop.replay_capacity,
         batch_size=256,

@@ -105,7 +105,7 @@ def main() -> None:
     with jax.enable_x64(True):  # the game counts in float64, but sbx in float32: the adapter keeps them apart
         split = make_split(bank, jax.random.key(0), options, config.max_iterations)
         game = make_game(config, kind, split.train, arguments.envs)
-    envs = ForStableBaselines(GymVectorGame(game))
+    envs = ForStableBaselines(GymVectorGame(game, "SameStep"))
 
     watch = Watch(arguments.seconds)
     model = SAC("MlpPolicy", envs, learning_starts=1000, gradient_steps=4, seed=0)

@@ -55,6 +55,7 @@ from jaxba.problem.part import part
 from jaxba.problem.preprocess import perturb
 from jaxba.problem.residuals import residual
 from jaxba.problem.rigs import Rigs
+from jaxba.runtime.gymnasium_registry import register_game
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.solver.drivers import IterationRecord
 from jaxba.solver.iteration import Carry
@@ -87,6 +88,8 @@ if TYPE_CHECKING:
 
 if _collects:
     gc.enable()
+
+register_game()
 
 __version__ = "0.1.0"
 

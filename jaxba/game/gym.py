@@ -12,6 +12,8 @@ import numpy as np
 
 from jaxba.damping.features import FEATURE_LIMIT
 from jaxba.game.env import Game, GameState
+from jaxba.game.protocol import Step
+from jaxba.runtime.gymnasium_registry import ID, register_game  # noqa: F401 - its name is asked for here
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 
@@ -24,24 +26,53 @@ except ModuleNotFoundError:
     raise ImportError("this needs Gymnasium: pip install jaxba[gym]") from None
 
 
-ID = "jaxba/BundleAdjustment-v0"  # name of the game for `gymnasium.make`, from the import of this module on
-
-_MADE_BY = "jaxba.training.api:gym_env"
-gymnasium.register(ID, _MADE_BY, vector_entry_point=_MADE_BY.replace("env", "vector_env"))
+register_game()
 
 _reset = jit(lambda game, key: game.reset(key))
 _step = jit(lambda game, state, action: game.step(state, action))
 
 
+@jit
+def _step_or_begin(game: Game, state: GameState, action: jax.Array, begins: jax.Array) -> tuple[GameState, Step]:
+    """A step where episodes end in their own last observation, and those that begin have their first, and no step.
+
+    Args:
+        game: the game; its own step begins the next episode where one ended.
+        state: before the step.
+        action: shape (envs, actions); of no effect where an episode begins.
+        begins: environments whose episode ended in the step before, shape (envs,)."""
+
+    def where(old: jax.Array, new: jax.Array) -> jax.Array:
+        return jnp.where(begins.reshape(-1, *(1,) * (new.ndim - 1)), old, new)
+
+    after, step = game.step(state, action)
+    after = after._replace(episodes=jax.tree.map(where, state.episodes, after.episodes))
+    observation = where(game.observations(state), step.final_observation)
+    reward = jnp.where(begins, 0, step.reward)
+    ends = {"terminated": step.terminated & ~begins, "truncated": step.truncated & ~begins}
+    return after, step._replace(observation=observation, reward=reward, **ends)
+
+
 class GymVectorGame(gymnasium.vector.VectorEnv):
-    """All scenes of a game. Where an episode ends, another begins in the same step.
+    """All scenes of a game. Where an episode ends, another begins: in the next step, which then plays no action, or in
+    the same one.
 
-    For each episode that ended, `infos` has the last observation in `final_obs` and the metrics of the episode in
-    `final_info`: `length`, `success`, `rejections`, and `ceres`, the iterations that Ceres' rule takes."""
+    For each episode that ended, `infos` has its metrics: `length`, `success`, `rejections`, and `ceres`, the iterations
+    that Ceres' rule takes. With resets in the same step they are in `final_info`, and the last observation in
+    `final_obs`, as Gymnasium has it."""
 
-    def __init__(self, game: Game) -> None:
-        """Random numbers are seeded by the operating system until `reset` is given a seed."""
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    def __init__(self, game: Game, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP) -> None:
+        """Random numbers are seeded by the operating system until `reset` is given a seed.
+
+        `autoreset_mode`: `NextStep`, Gymnasium's default, which its wrappers ask for, or `SameStep`. Raises ValueError:
+        another one."""
+        modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+        if autoreset_mode not in [*modes, *(mode.value for mode in modes)]:
+            names = " or ".join(mode.value for mode in modes)
+            raise ValueError(f"autoreset_mode must be {names}, is {getattr(autoreset_mode, 'value', autoreset_mode)}")
+        self._next_step = AutoresetMode(autoreset_mode) == AutoresetMode.NEXT_STEP
+        self._begins = np.zeros(game.num_envs, bool)  # where an episode ended in the last step
+        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
         self.num_envs = game.num_envs
         limit = FEATURE_LIMIT if game.config.agent.observation == "scale-free" else np.inf
         self._features = game.observation_size - game.privileged_size  # not what only critics see
@@ -61,6 +92,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
             raise ValueError(f"reset has no options, is given {', '.join(options)}")
         super().reset(seed=seed)
         game = self._opened()
+        self._begins[:] = False
         with numerics(game.bank.initial_cost.dtype, single_blas=False):
             self._state, observation = _reset(game, jax.random.key(int(self.np_random.integers(2**31))))
             return np.array(observation[:, : self._features]), {}
@@ -72,9 +104,18 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("call reset before step")
         actions = _actions(actions, self.action_space.shape)
         with numerics(game.bank.initial_cost.dtype, single_blas=False):
-            self._state, found = _step(game, self._state, jnp.asarray(actions, jnp.float32))
+            chosen = jnp.asarray(actions, jnp.float32)
+            if self._next_step:
+                self._state, found = _step_or_begin(game, self._state, chosen, self._begins)
+            else:
+                self._state, found = _step(game, self._state, chosen)
             step: Any = jax.tree.map(np.array, found)  # copies, which callers may keep and write to
-        infos = _infos(step, step.final_observation[:, : self._features], step.terminated | step.truncated)
+        done = step.terminated | step.truncated
+        if self._next_step:
+            infos = _metrics(step, done)
+            self._begins = done.copy()
+        else:
+            infos = _infos(step, step.final_observation[:, : self._features], done)
         reward = step.reward.astype(np.float64)
         return step.observation[:, : self._features], reward, step.terminated, step.truncated, infos
 
@@ -91,7 +132,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
 class GymGame(gymnasium.Env):
     """A game of one scene at a time, a random one of the bank in every episode.
 
-    When an episode ends, `info` has the metrics that `GymVectorGame` has in `final_info`."""
+    When an episode ends, `info` has the metrics that `GymVectorGame` has."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 
@@ -99,7 +140,7 @@ class GymGame(gymnasium.Env):
         """The game has a single environment."""
         if game.num_envs != 1:
             raise ValueError(f"a GymGame needs a game with one environment, this one has {game.num_envs}")
-        self._one = GymVectorGame(game)
+        self._one = GymVectorGame(game, AutoresetMode.SAME_STEP)
         self.observation_space, self.action_space = self._one.single_observation_space, self._one.single_action_space
         self._running = False
 
@@ -139,14 +180,22 @@ def _actions(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     return np.clip(array, -1, 1)
 
 
-def _infos(step: Any, observation: np.ndarray, done: np.ndarray) -> dict[str, Any]:
-    """In the form of gymnasium's own vector environments: an array per name, and the mask of its entries as `_name`."""
+def _metrics(step: Step, done: np.ndarray) -> dict[str, Any]:
+    """Metrics of the episodes that ended, as gymnasium's own vector environments have them: an array per name, and the
+    mask of its entries as `_name`."""
+    metrics: dict[str, Any] = {}
+    if done.any():
+        for name, values in step.metrics.items():
+            metrics |= {name: np.where(done, values, 0), f"_{name}": done.copy()}
+    return metrics
+
+
+def _infos(step: Step, observation: np.ndarray, done: np.ndarray) -> dict[str, Any]:
+    """The metrics and last observations of the episodes that ended, where others began in the same step."""
     if not done.any():
         return {}
     last = np.full(len(done), None, dtype=object)
     for k in np.flatnonzero(done):
         last[k] = observation[k].copy()
-    metrics: dict[str, Any] = {}
-    for name, values in step.metrics.items():
-        metrics |= {name: np.where(done, values, 0), f"_{name}": done.copy()}
+    metrics = _metrics(step, done)
     return {"final_obs": last, "_final_obs": done.copy(), "final_info": metrics, "_final_info": done.copy()}

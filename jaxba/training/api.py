@@ -129,9 +129,22 @@ def gym_env(preset: str = "paper", overrides: Sequence[str] = (), **settings: An
 
 
 def gym_vector_env(
-    num_envs: int = 64, preset: str = "paper", overrides: Sequence[str] = (), **settings: Any
+    num_envs: int = 64,
+    preset: str = "paper",
+    overrides: Sequence[str] = (),
+    autoreset_mode: str = "NextStep",
+    **settings: Any,
 ) -> GymVectorGame:
-    """The same for `gymnasium.make_vec`: many scenes in one compiled program."""
+    """The same for `gymnasium.make_vec`: many scenes in one compiled program.
+
+    Args:
+        num_envs: scenes in play.
+        preset: as for `make_env`.
+        overrides: as for `make_env`.
+        autoreset_mode: when the next episode begins: `NextStep`, Gymnasium's default, or `SameStep`.
+        settings: other arguments of `make_env`.
+
+    Raises: as `make_env`; ValueError: another mode."""
     from jaxba.game.gym import GymVectorGame
 
-    return GymVectorGame(make_env(preset, *overrides, f"envs={num_envs}", **settings))
+    return GymVectorGame(make_env(preset, *overrides, f"envs={num_envs}", **settings), autoreset_mode)

@@ -36,7 +36,7 @@ def single(game):
 
 @pytest.fixture
 def envs(game):
-    env = GymVectorGame(game)
+    env = GymVectorGame(game, AutoresetMode.SAME_STEP)
     yield env
     env.close()
 
@@ -195,8 +195,9 @@ def test_options_of_a_reset_are_refused(envs):
         envs.reset(options={"reset_mask": np.ones(6, bool)})
 
 
-def test_wrappers_of_gymnasium_count_every_episode(game):
-    counted = gymnasium.wrappers.vector.RecordEpisodeStatistics(GymVectorGame(game))
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_wrappers_of_gymnasium_count_every_episode(game, mode):
+    counted = gymnasium.wrappers.vector.RecordEpisodeStatistics(GymVectorGame(game, mode))
     counted.reset(seed=0)
     ends = 0
     for _ in range(9):
@@ -205,6 +206,63 @@ def test_wrappers_of_gymnasium_count_every_episode(game):
         if (terminated | truncated).any():
             assert (infos["episode"]["l"][terminated | truncated] <= 5).all()
     assert counted.episode_count == ends > 6
+
+
+def test_wrappers_that_ask_for_the_next_step_take_what_is_made_by_default(game):
+    envs = GymVectorGame(game)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    wrappers = gymnasium.wrappers.vector
+    wrapped = wrappers.NormalizeObservation(wrappers.NormalizeReward(envs))
+    wrapped.reset(seed=0)
+    for _ in range(6):
+        assert np.isfinite(wrapped.step(np.zeros((6, 1), np.float32))[0]).all()
+
+
+def play(game, mode, steps):
+    """Rows of observations, rewards and ends, and the metrics of episodes by step, with the same action everywhere."""
+    envs = GymVectorGame(game, mode)
+    rows = [envs.reset(seed=4)[0]]
+    rewards = []
+    ends = []
+    infos = []
+    for _ in range(steps):
+        observation, reward, terminated, truncated, info = envs.step(np.full((6, 1), 0.3, np.float32))
+        rows.append(observation)
+        rewards.append(reward)
+        ends.append(terminated | truncated)
+        infos.append(info)
+    return np.stack(rows), np.stack(rewards), np.stack(ends), infos
+
+
+def test_episodes_are_the_same_whether_they_begin_in_the_same_step_or_in_the_next(game):
+    rows, rewards, ends, infos = play(game, "NextStep", 10)
+    same_rows, same_rewards, same_ends, same_infos = play(game, AutoresetMode.SAME_STEP, 9)
+    for k in range(6):
+        first, second = np.flatnonzero(same_ends[:, k])[:2]
+        np.testing.assert_array_equal(np.flatnonzero(ends[:, k])[:2], [first, second + 1])
+        np.testing.assert_array_equal(rows[: first + 1, k], same_rows[: first + 1, k])
+        np.testing.assert_array_equal(rows[first + 1, k], same_infos[first]["final_obs"][k])
+        np.testing.assert_array_equal(rows[first + 2, k], same_rows[first + 1, k])  # the next episode begins
+        np.testing.assert_array_equal(rows[first + 2 : second + 2, k], same_rows[first + 1 : second + 1, k])
+        assert rewards[first + 1, k] == 0
+        np.testing.assert_array_equal(np.delete(rewards[: second + 2, k], first + 1), same_rewards[: second + 1, k])
+        for name, values in same_infos[first]["final_info"].items():
+            assert infos[first][name][k] == values[k]
+        assert infos[first]["_length"][k]
+        assert not infos[first + 1].get("_length", np.zeros(6))[k]
+
+
+def test_another_mode_is_refused(game):
+    for mode in ("Disabled", AutoresetMode.DISABLED, "same"):
+        with pytest.raises(ValueError, match="autoreset_mode must be NextStep or SameStep, is "):
+            GymVectorGame(game, mode)
+
+
+@pytest.mark.parametrize("module", ["jaxba", "jaxba.game.gym"])
+def test_gymnasium_knows_the_game_once_a_module_is_imported(module):
+    script = f"import gymnasium, {module}; print(gymnasium.spec({gym.ID!r}).vector_entry_point)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert done.stdout == "jaxba.training.api:gym_vector_env\n", done.stderr
 
 
 # Other processes
