@@ -159,10 +159,8 @@ def units(survey: Survey, rng: Rng) -> Words:
     survey.marks = survey.marks[kept]
     survey.mark_seen = survey.mark_seen[kept]
     survey.mark_pixels = survey.mark_pixels[kept]
-    if rng.random() < 0.5:
-        survey.marks = survey.marks[:, [1, 0, 2]]
-    else:
-        survey.marks = survey.marks * [1, 1, -1]
+    level = survey.shape != "facade"  # mirrored along their normal, three points are in the same plane
+    survey.marks = survey.marks[:, [1, 0, 2]] if level else survey.marks * [1, 1, -1]
     return (*AXES, *MARKS, "upside")
 
 
@@ -298,7 +296,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for number, survey in enumerate(clean_surveys(args.clean, args.seed)):
         outcome = looked_at(survey, bool(args.command) and number % args.command == args.command - 1)
         clean.append(outcome)
-        if args.verbose or outcome.said or not outcome.right:
+        if args.verbose or outcome.said:
             _print(f"clean {'NOTED' if outcome.said else 'quiet'}: {survey.heading}", outcome)
     print(table(kinds, results, clean))
     print(f"{time.perf_counter() - began:.0f} s")

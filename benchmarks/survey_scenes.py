@@ -206,7 +206,19 @@ def _facade(kind: Shape, rng: np.random.Generator, view: float, width: float = 4
 
 
 def _room(kind: Shape, rng: np.random.Generator, view: float) -> tuple:
-    return _facade(kind, rng, view, width=5.0, deep=1.5)
+    width = 5.0
+    turns, centres, sample = _facade(kind, rng, view, width, deep=0.0)
+    phase = rng.uniform(0, 6, 2)
+
+    def surface(count: int, rng: np.random.Generator) -> np.ndarray:
+        """One wall that waves: neighbours in an image have nearly the same depth, as in a map."""
+        places = sample(count, rng)
+        places[:, 2] += 0.2 * np.sin(2 * places[:, 0] + phase[0])
+        ahead = places - centres.mean(axis=0)
+        waves = 1 + 0.2 * np.sin(1.5 * places[:, :1] + phase[0]) * np.cos(1.5 * places[:, 2:] + phase[1])
+        return centres.mean(axis=0) + ahead * waves
+
+    return turns, centres, surface
 
 
 _AT = {"block": _block, "strip": _strip, "facade": _facade, "room": _room}
