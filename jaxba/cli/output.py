@@ -9,7 +9,16 @@ import numpy as np
 
 from jaxba.cli import common, table
 from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
-from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem, write_transforms
+from jaxba.io import (
+    check_model,
+    check_output,
+    formats,
+    is_colmap,
+    is_folder,
+    write_colmap,
+    write_problem,
+    write_transforms,
+)
 from jaxba.io.files import StrPath
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.solve import Solution
@@ -60,7 +69,9 @@ def check_outputs(
 
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:
-    """Checks that the format of the output can hold the problem's lenses. Raises ProblemError: it cannot; one line."""
+    """Checks that the format of the output can hold the problem. Raises ProblemError: it cannot; one line."""
+    if output and is_model(output, source) and not _is_like_source(output, source):
+        check_model(problem, output)
     if output and not is_model(output, source):
         known = formats.by_ending(output, written=True) or formats.FORMATS[0]
         if known.check is not None:

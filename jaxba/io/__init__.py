@@ -8,7 +8,7 @@ import warnings
 from jaxba.io import formats
 from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
-from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
+from jaxba.io.colmap import check_model, is_colmap, read_colmap, write_colmap
 from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.nerfstudio import write_transforms
 from jaxba.io.ply import write_ply

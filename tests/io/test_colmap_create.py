@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import support
+from scipy.spatial.transform import Rotation
 
 from jaxba import BundleProblem, Lenses, ProblemError, read_problem, write_bal, write_colmap, write_problem
 from jaxba.cli.solve import run
@@ -116,7 +118,7 @@ def test_cameras_and_points_that_nothing_sees_are_written_too(tmp_path):
 
 
 REFUSED = {
-    "focal length": ({"cameras": (2, 6, -500.0)}, "f of camera 2 is -500, and COLMAP's focal lengths are positive"),
+    "focal length": ({"cameras": (2, 6, 0.0)}, "f of camera 2 is 0, and COLMAP's focal lengths are positive"),
     "far pixel": ({"observations": (5, 0, 1e12)}, r"a pixel is 1e\+12 from the centre of its image"),
     "no number": ({"points": (4, 1, np.nan)}, r"points\[4\] is not finite"),
 }
@@ -158,3 +160,53 @@ def test_the_command_writes_the_solution_of_a_bal_file_into_a_folder(tmp_path, c
     assert f"wrote {tmp_path}/new/\n" in printed.out
     assert printed.err == ""
     assert geometry.cost(read_problem(tmp_path / "new")) < 0.99 * geometry.cost(support.tiny())
+
+
+def rolled(problem: BundleProblem, cameras: list[int]) -> BundleProblem:
+    """The problem with some cameras rolled by 180 degrees, and their focal lengths negative: the same pixels."""
+    numbers = np.array(problem.cameras)
+    turn = Rotation.from_euler("z", 180, degrees=True)
+    numbers[cameras, :3] = (turn * Rotation.from_rotvec(numbers[cameras, :3])).as_rotvec()
+    numbers[cameras, 3:6] = turn.apply(numbers[cameras, 3:6])
+    numbers[cameras, 6] *= -1
+    return problem.replace(cameras=numbers)
+
+
+@pytest.mark.parametrize("target", ["new/", "transforms.json"])
+def test_cameras_of_a_negative_focal_length_are_written_as_rolled_ones(tmp_path, target):
+    problem = support.tiny()
+    write_problem(rolled(problem, [1, 4]), f"{tmp_path}/{target}")
+    write_problem(problem, f"{tmp_path}/same{target}")
+    if target == "new/":
+        same_problem(read_problem(tmp_path / "new"), problem)
+    else:
+        found, same = (json.loads((tmp_path / name).read_text()) for name in (target, f"same{target}"))
+        for one, other in zip(found["frames"], same["frames"], strict=True):
+            assert one["fl_x"] == other["fl_x"] > 0
+            np.testing.assert_allclose(one["transform_matrix"], other["transform_matrix"], atol=1e-13)
+
+
+def test_a_model_whose_focal_length_became_negative_is_written_into_itself(tmp_path):
+    problem = support.tiny()
+    write_problem(problem, f"{tmp_path}/old/")
+    old = read_problem(tmp_path / "old")
+    write_colmap(rolled(old, [2]), tmp_path / "new", like=tmp_path / "old")
+    same_problem(read_problem(tmp_path / "new"), old)
+
+
+def test_a_solve_of_cameras_with_negative_focal_lengths_writes_its_model(tmp_path, capsys):
+    write_bal(rolled(support.tiny(), [0, 3]), tmp_path / "rolled.txt")
+    assert run([str(tmp_path / "rolled.txt"), "--max-iterations", "1", "--output", f"{tmp_path}/model/"]) == 0
+    assert "wrote" in capsys.readouterr().out
+    assert (read_problem(tmp_path / "model").cameras[:, 6] > 0).all()
+
+
+def test_a_pixel_that_no_model_holds_is_refused_before_the_solve(tmp_path, capsys):
+    problem = support.tiny()
+    pixels = np.array(problem.observations)
+    pixels[5, 0] = 1e12
+    write_bal(problem.replace(observations=pixels), tmp_path / "far.txt")
+    assert run([str(tmp_path / "far.txt"), "--output", f"{tmp_path}/model/"]) == 2
+    printed = capsys.readouterr()
+    assert "is 1e+12 from the centre of its image" in printed.err
+    assert "iteration" not in printed.out

@@ -5,4 +5,4 @@ without COLMAP. Source: COLMAP, doc/cameras.rst and doc/format.rst."""
 
 from jaxba.io.colmap.files import is_colmap
 from jaxba.io.colmap.read import read_colmap
-from jaxba.io.colmap.write import write_colmap
+from jaxba.io.colmap.write import check_model, write_colmap

@@ -47,6 +47,7 @@ def write_colmap(
     Without another model, image, camera and point ids count from 1, and images are called `image0001.jpg` and so on.
     Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and constant.
     Its image size is made up: the smallest even one that holds all its pixels around the centre, its principal point.
+    Where f is negative, the camera is rolled by 180 degrees instead, which gives the same pixels.
     Other lenses keep their pixels, models and numbers. Weights, and what is constant, cannot be stored.
 
     `rejected` are observations that `read_colmap` made of the other model (`Solution.rejected`): they leave the tracks,
@@ -70,10 +71,43 @@ def write_colmap(
     write_model(_with_rigs(model), folder, ".txt" if text else ".bin")
 
 
+def check_model(problem: BundleProblem, folder: StrPath) -> None:
+    """Checks, before a solve, that a new COLMAP model can hold a problem. Raises ProblemError: it cannot.
+
+    Args:
+        problem: any problem.
+        folder: what messages say is written."""
+    target = display_name(folder)
+    lenses = every_lens(problem)
+    for lens in np.unique(np.asarray(lenses.index)).tolist():
+        name = lenses.model_of(lens).name
+        if not lenses.all_bal and name not in records.MODELS:
+            raise ProblemError(f"cannot write {target}: COLMAP has no camera model {name}")
+    farthest = float(np.abs(problem.observations).max(initial=0.0))
+    if farthest > _LARGEST_HALF:
+        raise ProblemError(f"cannot write {target}: a pixel is {farthest:g} from the centre of its image")
+
+
+def _with_positive_focals(problem: BundleProblem) -> BundleProblem:
+    """The problem with BAL's cameras of a negative focal length as cameras of a positive one that are rolled by 180
+    degrees about their view: the same pixels, since `f p` is `(-f)(-p)`. In rigs they stay."""
+    bal = problem.lenses is None or problem.lenses.all_bal
+    rolled = np.asarray(problem.cameras)[:, 6] < 0
+    if not bal or problem.rigs is not None or not rolled.any():
+        return problem
+    cameras = np.array(problem.cameras, np.float64)
+    roll = np.diag([-1.0, -1.0, 1.0])
+    cameras[rolled, :3] = angle_axis(roll @ geometry.rotation_matrices(cameras[rolled, :3]))
+    cameras[rolled, 3:6] = cameras[rolled, 3:6] @ roll
+    cameras[rolled, 6] *= -1
+    return problem.replace(cameras=cameras)
+
+
 def with_problem(model: Model, problem: BundleProblem, target: str) -> tuple[Model, Assembled]:
     """A model with the lenses, poses and places in rigs of a problem that was made of it, and what it was made of.
     `target` is what messages say is written. Raises ProblemError: another model's problem, or unstorable."""
     bal = problem.lenses is None or problem.lenses.all_bal
+    problem = _with_positive_focals(problem)
     assembled = assemble(model, refine_principal_point=not bal)
     if (problem.num_cameras, problem.num_points) != (len(assembled.images), len(assembled.points)):
         raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(model.folder)}")
@@ -214,7 +248,7 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     written. Raises ProblemError: the problem is not valid, a focal length is not positive, or a pixel lies too far
     away."""
     arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
-    valid = BundleProblem.create(*arrays, lenses=problem.lenses)
+    valid = _with_positive_focals(BundleProblem.create(*arrays, lenses=problem.lenses))
     cameras, camera_index, point_index = map(np.asarray, (valid.cameras, valid.camera_index, valid.point_index))
     lenses = every_lens(valid)
     wrong = np.flatnonzero(~(cameras[:, 6] > 0))
