@@ -10,6 +10,7 @@ from jaxtyping import Int
 from jaxba import residuals
 from jaxba.constraints import depth_maps, values
 from jaxba.io.files import StrPath
+from jaxba.io.image_files import files_of_images
 from jaxba.io.notes import report
 from jaxba.io.positions import read_gravity
 from jaxba.model.registration import with_residual
@@ -173,9 +174,7 @@ def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool, m
         raise ValueError(f"folder: there is no folder {folder}")
     relative = values.parse_deviations("stddev", value["stddev"])[0]
     names = list(map(str, range(problem.num_cameras))) if problem.labels is None else problem.labels.names
-    files = [
-        next((x for x in (folder / f"{n}.npy", (folder / n).with_suffix(".npy")) if x.is_file()), None) for n in names
-    ]
+    files = files_of_images(folder, names, ".npy")
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
     leave_out(where, "image", "{} without a map", missing, strict)
     camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)

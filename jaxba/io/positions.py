@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.image_files import files_of_images
 from jaxba.io.json_records import Record, read_json
 from jaxba.io.nerfstudio import IMAGES
 from jaxba.io.position_tables import WGS84, Positions, read_table, without_accuracy
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
-from jaxba.problem.image_names import named_images
 
 GPS, ABOVE_SEA = 0x8825, 5
 """Block of the EXIF data of a photo with its position, and the field that is 1 below sea level."""
@@ -111,11 +111,8 @@ def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:
     another case or with another ending. Raises ProblemError: none has; one line."""
     found, places = [], []
     names = list(names)
-    lost = [name for name in names if not Path(folder, name).is_file()]
-    files = sorted(file.relative_to(folder).as_posix() for file in Path(folder).rglob("*") if lost and file.is_file())
-    others = {name: files[at] for name, at in named_images(lost, files).positions.items()}
-    for name in names:
-        place = _place_of(Path(folder, others.get(name, name)))
+    for name, file in zip(names, files_of_images(folder, names), strict=True):
+        place = None if file is None else _place_of(file)
         if place is not None:
             found.append(name)
             places.append(place)

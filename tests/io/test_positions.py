@@ -14,6 +14,7 @@ from PIL import Image
 
 from jaxba import ProblemError, ProblemWarning
 from jaxba.io.geodesy import Frame, in_frame, projected, system_of
+from jaxba.io.image_files import files_of_images
 from jaxba.io.positions import read_database, read_photos, read_table, read_transforms
 
 PLACES = np.array([[8.5, 47.3, 500.0], [8.51, 47.31, 620.0], [8.52, 47.29, 480.0]])
@@ -280,6 +281,16 @@ def test_photos_have_the_position_of_their_camera(tmp_path):
     np.testing.assert_allclose(places, [[-8.51, -47.3, 500], [8.51, 47.3, -2.5]], atol=1e-9)
     with pytest.raises(ProblemError, match="no photo of the model there has a GPS position"):
         read_photos(tmp_path, ["c.jpg"])
+
+
+def test_files_of_images_are_found_by_other_names(tmp_path):
+    for name in ("a.JPG", "deep/b.tif", "deep/b.jpg.npy", "c.npy", "one/d.png", "two/d.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    found = files_of_images(tmp_path, ["flight/a.jpg", "b.jpg", "d.png", "two/d.png", "e.png"])
+    assert found == [tmp_path / "a.JPG", tmp_path / "deep/b.tif", None, tmp_path / "two/d.png", None]
+    found = files_of_images(tmp_path, ["a.jpg", "b.jpg", "C.JPG"], ".npy")
+    assert found == [None, tmp_path / "deep/b.jpg.npy", tmp_path / "c.npy"]
 
 
 def test_positions_of_nerfstudio_are_in_the_world_before_its_transform(tmp_path):
