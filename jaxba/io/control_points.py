@@ -36,7 +36,7 @@ def read_control_points(path: StrPath) -> ControlPoints:
     a place is NaN. Source: docs.opendronemap.org/gcp. Raises ProblemError: it cannot be read, or a line is malformed;
     one line that names the file and line."""
     file = display_name(path)
-    lines = enumerate(read_characters(path).split("\n"), 1)
+    lines = enumerate(read_characters(path, otherwise="cp1252").split("\n"), 1)
     given = [(number, line.strip()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
     if len(given) < 2:
         raise ProblemError(f"{file}: has no points")

@@ -38,12 +38,15 @@ def text_pieces(path: StrPath) -> Iterator[bytes]:
         ) from None
 
 
-def read_characters(path: StrPath) -> str:
-    """The same as characters. Raises ProblemError: as `read_text`, or it is no UTF-8."""
-    try:
-        return read_text(path).decode()
-    except UnicodeDecodeError:
-        raise ProblemError(f"{display_name(path)}: is no text (UTF-8, or UTF-16 with a byte order mark)") from None
+def read_characters(path: StrPath, *, otherwise: str = "utf-8") -> str:
+    """The same as characters, UTF-8 or else another encoding. Raises ProblemError: as `read_text`, or it is neither."""
+    text = read_text(path)
+    for encoding in ("utf-8", otherwise):
+        try:
+            return text.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise ProblemError(f"{display_name(path)}: is no text (UTF-8, or UTF-16 with a byte order mark)")
 
 
 def plain_text(data: bytes) -> bytes:

@@ -12,33 +12,38 @@ from jaxtyping import Float
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.geodesy import NOT_SAID, system_of
-from jaxba.io.tables import LEAST_POSITIONS, cells_of, file_joined, is_value, separator_of, title_of, value_of
+from jaxba.io.tables import LEAST_POSITIONS, cells_of, file_joined, is_value, plain, separator_of, title_of, value_of
 from jaxba.problem.bundle_problem import ProblemError
 
 WGS84 = "EPSG:4326"  # what longitudes and latitudes are of, if nothing else is said
 
 WORDS = {
     "name": "image images imagename imagefile imagefilename imagepath photo photos photoname photofile file filename "
-    "filepath label name sourcefile cameralabel cameraname",
-    "x": "x easting east e xeasting eastingx geox coordx xcoord xcoordinate utmx utmeasting",
-    "y": "y northing north n ynorthing northingy geoy coordy ycoord ycoordinate utmy utmnorthing",
+    "filepath label name sourcefile cameralabel cameraname "
+    "bild bildname foto",
+    "x": "x easting east e xeasting eastingx geox coordx xcoord xcoordinate utmx utmeasting rechtswert",
+    "y": "y northing north n ynorthing northingy geoy coordy ycoord ycoordinate utmy utmnorthing hochwert",
     "longitude": "longitude lon lng long gpslongitude xlongitude longitudex geolon",
     "latitude": "latitude lat gpslatitude ylatitude latitudey geolat",
     "height": "z height altitude alt elevation elev up gpsaltitude zaltitude zheight zelevation altitudez geoz coordz "
-    "zcoord zcoordinate ellipsoidalheight ellipsoidheight heightellipsoidal altitudeellipsoidal absolutealtitude",
-    "sx": "sigmax sx accuracyx xaccuracy accx stdx xstd stddevx sigmaeast accuracyeast eastaccuracy stdeast sdeast sde "
-    "stdlon rtkstdlon sigmalongitude accuracylongitude",
-    "sy": "sigmay sy accuracyy yaccuracy accy stdy ystd stddevy sigmanorth accuracynorth northaccuracy stdnorth "
-    "sdnorth sdn stdlat rtkstdlat sigmalatitude accuracylatitude",
-    "sxy": "accuracyhorizontal horizontalaccuracy accuracyhorz accuracyhoriz horzaccuracy accuracyxy xyaccuracy "
-    "accuracyh haccuracy hacc sigmah sigmaxy sdh horizontal horizontalstd stdhorizontal horizontalsigma "
-    "sigmahorizontal accuracyhor",
-    "sz": "accuracyvertical verticalaccuracy accuracyvert vertaccuracy accuracyver accuracyz zaccuracy accuracyv "
-    "vaccuracy vacc accz sigmav vertical sigmaup accuracyup upaccuracy stdup sdup sdu sdv sigmaz sz stdz zstd stddevz "
-    "stdhgt rtkstdhgt sigmavertical stdvertical verticalstd verticalsigma accuracyaltitude accuracyheight sigmaheight",
-    "s": "accuracy sigma stddev std s positionaccuracy accuracyposition accuracyxyz xyzaccuracy",
+    "zcoord zcoordinate ellipsoidalheight ellipsoidheight heightellipsoidal altitudeellipsoidal absolutealtitude "
+    "höhe",
+    "sxy": "horizontal gpshpositioningerror",
+    "sz": "vertical",
 }
 """Names of the columns of a table, in letters alone and without units."""
+
+ACCURACY = "accuracy acc sigma stddev stdev std sd s precision rms rmse uncertainty"
+"""What accuracies are called, before or after what they are of."""
+
+DIRECTIONS = {
+    "sx": "x e east easting lon long longitude",
+    "sy": "y n north northing lat latitude",
+    "sxy": "xy h hor horz horiz horizontal lateral planimetric",
+    "sz": "z v ver vert vertical u up height hgt alt altitude elevation elev",
+    "s": "xyz d position",  # d: of 3d
+}
+"""What accuracies are of, by what `Layout` calls these."""
 
 ACCURACIES = ("sx", "sy", "sxy", "sz", "s")
 
@@ -60,7 +65,7 @@ to 3 times (data sheets of receivers)."""
 
 LARGEST_SHARE = 0.01  # extent of positions in degrees, over their distance from 0, 0: metres of a scene are not so far
 
-_MAYBE = re.compile(r"accura|sigma|std|uncertain")
+_MAYBE = re.compile(r"accura|sigma|std|uncertain|precision")
 _ANGLES = re.compile(r"yaw|pitch|roll|omega|phi|kappa|heading|attitude|rotation|angle|deg")
 
 
@@ -108,7 +113,7 @@ def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Position
     Raises:
         ProblemError: it cannot be read, or a column is missing; one line that names the file and line."""
     file = display_name(path)
-    lines = read_characters(path).split("\n")
+    lines = read_characters(path, otherwise="cp1252").split("\n")  # that of spreadsheets on Windows
     layout = _with_names(lines) or _without_names(lines, file, crs_is_geographic)
     column = layout.columns
     degrees = {"longitude", "latitude"} <= column.keys()
@@ -126,7 +131,7 @@ def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Position
         if not cells[column["name"].at]:
             raise ProblemError(f"{where}: names no image")
         names.append(cells[column["name"].at])
-        places.append([value_of(cells[column[axis].at], axis, where) for axis in axes])
+        places.append([value_of(plain(cells[column[axis].at]), axis, where) for axis in axes])
         given.append([cells[column[what].at] for what in known])
     if not names:
         raise ProblemError(f"{file}: has no positions")
@@ -154,7 +159,7 @@ def _with_names(lines: Sequence[str]) -> Layout | None:
 
 def _named(titles: Sequence[str]) -> tuple[dict[str, Column], tuple[str, ...]]:
     """The column of each thing that a line of names has, and titles of those that may be accuracies."""
-    known = {word: what for what, words in WORDS.items() for word in words.split()}
+    known = _known_names()
     columns: dict[str, Column] = {}
     unused = []
     for at, title in enumerate(titles):
@@ -164,6 +169,17 @@ def _named(titles: Sequence[str]) -> tuple[dict[str, Column], tuple[str, ...]]:
         elif _MAYBE.search(name) and not _ANGLES.search(title.lower()):
             unused.append(title)
     return columns, tuple(unused)
+
+
+def _known_names() -> dict[str, str]:
+    """What columns have, by the letters of their names."""
+    known = {word: what for what, words in WORDS.items() for word in words.split()}
+    for what, directions in DIRECTIONS.items():
+        for accuracy in ACCURACY.split():
+            for direction in directions.split():
+                named = [f"{accuracy}{direction}", *([f"{direction}{accuracy}"] if accuracy != "s" else [])]
+                known |= {before + name: what for name in named for before in ("", "rtk", "gps", "gnss")}
+    return known | {accuracy: "s" for accuracy in ACCURACY.split()}
 
 
 def _without_names(lines: Sequence[str], file: str, crs_is_geographic: bool | None) -> Layout:

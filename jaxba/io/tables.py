@@ -34,6 +34,8 @@ UNITS = {
 
 _FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,3}$")
 _NUMBER = re.compile(r"[-+]?[.,]?\d([\d.,]*\d)?\.?([eE][-+]?\d+)?")
+_ANGLE = re.compile(r"([\d.]+)\s*(?:°|deg)?\s*(?:([\d.]+)\s*')?\s*(?:([\d.]+)\s*\")?\s*([NSEW])", re.IGNORECASE)
+_HEIGHT = re.compile(r"([-+]?[\d.,]+)\s*m(?:\s+(above|below) sea level)?", re.IGNORECASE)
 _QUOTED = re.compile(r'"([^"]*)"|(\S+)')
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?")
 
@@ -95,6 +97,19 @@ def value_of(cell: str, field: str, where: str) -> float:
         plain = plain[:last].translate({ord(","): None, ord("."): None}) + "." + plain[last + 1 :]
     (number,) = finite_numbers([plain.replace(",", "") if "," in plain else plain], [field], where)
     return np.nan if number in NO_NUMBER else number
+
+
+def plain(cell: str) -> str:
+    """The number of a cell as ExifTool writes coordinates: `47 deg 18' 5.25" S`, `12.5 m Below Sea Level`."""
+    angle = _ANGLE.fullmatch(cell)
+    if angle is not None:
+        parts = [float(part or 0) for part in angle.groups()[:3]]
+        degrees = parts[0] + parts[1] / 60 + parts[2] / 3600
+        return repr(-degrees if angle[4].upper() in "SW" else degrees)
+    height = _HEIGHT.fullmatch(cell)
+    if height is not None:
+        return f"-{height[1]}" if height[2] and height[2].lower() == "below" else height[1]
+    return cell
 
 
 def has_fix(places: Float[np.ndarray, "n 3"], degrees: bool) -> Bool[np.ndarray, " n"]:

@@ -93,7 +93,7 @@ def test_units_are_those_of_the_names_of_columns(title, units, tmp_path):
         ("hacc,vacc", ["1,4", "2,", ",5"], [[1, 1, 4], [2, 2, 5], [2, 2, 5]], "no accuracy of 2 images"),
         ("accuracy_horizontal", ["1", "2", "3"], [[1, 1, 2], [2, 2, 4], [3, 3, 6]], "they get 2 times the horizontal"),
         ("accuracy_vertical", ["1", "2", "3"], [[1] * 3, [2] * 3, [3] * 3], "positions get that of heights"),
-        ("accuracy 3d", ["1", "2", "3"], None, "accuracies in column accuracy 3d are not used: .* is 1$"),
+        ("accuracy class", ["1", "2", "3"], None, "accuracies in column accuracy class are not used: .* is 1$"),
         ("accuracy", ["fixed", "float", ""], None, "accuracies in column accuracy are not used: .* is 1$"),
     ],
 )
@@ -108,6 +108,37 @@ def test_what_a_table_lacks_of_accuracies_is_said(columns, cells, deviations, no
         assert found.covariances is None
     else:
         np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2)), deviations)
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        "Std. dev. East [m],Std. dev. North [m],Std. dev. Up [m]",
+        "RtkStdLon,RtkStdLat,RtkStdHgt",
+        "Easting RMS,Northing RMS,Elevation RMS",
+        "sigma_x,sigma_y,sigma_z",
+        "sdE,sdN,sdU",
+        "x precision,y precision,z precision",
+    ],
+)
+def test_accuracies_have_the_names_that_programs_give_them(columns, tmp_path):
+    (tmp_path / "log.csv").write_text(f"image,x,y,z,yaw accuracy,{columns}\na.jpg,1,2,3,9,1,2,3\n")
+    found = read_table(tmp_path / "log.csv")
+    assert found.covariances is not None
+    assert (np.diagonal(found.covariances[0]).tolist(), found.notes) == ([1, 4, 9], ())
+
+
+def test_coordinates_of_exiftool_and_a_spreadsheet_in_the_encoding_of_windows_are_read(tmp_path):
+    lines = [
+        "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude",
+        './a.jpg,"47 deg 15\' 0.00"" S","8 deg 30\' 0.00"" E",12.5 m Below Sea Level',
+        "./b.jpg,47.25 N,8.5 W,12.5 m",
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    assert read_table(tmp_path / "log.csv").places.tolist() == [[8.5, -47.25, -12.5], [-8.5, 47.25, 12.5]]
+    (tmp_path / "log.csv").write_bytes("Bild;Rechtswert;Hochwert;Höhe\nä.jpg;1,5;2,5;3,5\n".encode("cp1252"))
+    found = read_table(tmp_path / "log.csv")
+    assert (found.names, found.places.tolist()) == (["ä.jpg"], [[1.5, 2.5, 3.5]])
 
 
 NO_FIX = {
