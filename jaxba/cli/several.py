@@ -75,7 +75,7 @@ def solve_all(
     names = _names(paths)
     folder = Path(args.output) if args.output else None
     made_by = options_digest(args, policy, options)
-    done = _begin(folder, paths, names, made_by, resume=args.resume) if folder else set()
+    done = _begin(folder, paths, names, made_by, resume=args.resume) if folder else {}
     left = [(path, name) for path, name in zip(paths, names, strict=True) if name not in done]
     common.prepare_process()
     began, shown, rows = time.monotonic(), -1e9, list[Row]()
@@ -115,7 +115,11 @@ def solve_all(
     if interrupt.requested and len(rows) < len(left):
         common.print_line(f"{len(left) - len(rows)} are left: --resume goes on")
         return INTERRUPTED
-    return common.BAD_INPUT if failed else common.misfit_status(args.strict, sum(bool(row.notes) for row in rows))
+    return (
+        common.BAD_INPUT
+        if failed
+        else common.misfit_status(args.strict, sum(bool(row.notes) for row in (*done.values(), *rows)))
+    )
 
 
 class _Problems:
@@ -158,7 +162,7 @@ def _written(name: str, source: str) -> str:
     return f"{name}.txt" if lost and not is_colmap(source) else name
 
 
-def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: str, *, resume: bool) -> set[str]:
+def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: str, *, resume: bool) -> dict[str, Row]:
     """Makes the folder and its file of costs, and says what is done already.
 
     Args:
@@ -169,7 +173,7 @@ def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: st
         resume: whether a run may go on.
 
     Returns:
-        Names of solutions that are there, made by the same options from the same files.
+        Rows of solutions that are there, made by the same options from the same files, by their names.
 
     Raises:
         UsageError: a solution would replace a file of a problem, or the folder holds what it may not; one line."""
@@ -193,7 +197,7 @@ def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: st
     if anew:
         changed, lost = len(there - done), len(anew) - len(there - done)
         common.print_line(f"solved anew: {changed} whose files have changed, {lost} whose solutions are not there")
-    return done
+    return {name: rows[name] for name in done}
 
 
 def _stored(output: Path, solution: Solution, source: str) -> Result:

@@ -14,6 +14,8 @@ from row_examples import OWN, READY_MADE
 import jaxba
 from jaxba import BundleProblem, Solution, SolveOptions, solve_many
 from jaxba.lm.termination import Tolerances
+from jaxba.problem.options import ConjugateGradients
+from jaxba.problem.preprocess import shift
 from jaxba.runtime.numerics import numerics
 from jaxba.solver import checkpoint, many, sharded
 from jaxba.solver.lanes import Starts, solve_rows
@@ -21,7 +23,9 @@ from jaxba.solver.prepare import set_up
 from jaxba.structure.cells import Sizes
 
 OPTIONS = SolveOptions(compilation="quick", max_iterations=4)
-IMPLICIT = replace(OPTIONS, linear_solver="implicit")
+EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-12)
+"""To the solution of the linear system: steps that stop before it differ by up to 1e-5 with the order of sums."""
+
 DEVICES = 3  # of the tests (conftest.py)
 ALIKE = 1e-9  # largest relative difference of costs
 
@@ -80,9 +84,16 @@ def test_rows_of_any_residual_are_solved_among_many_as_alone(name, small):
 
 
 @pytest.mark.slow
+def test_rows_of_scenes_in_map_coordinates_are_each_in_its_own_frame(small):
+    """These are solved near the origin, from which each was moved by another way."""
+    near = problems_of(["control_point", "position"], 4)
+    assert_as_alone([shift(one, np.array([4e3 * (1 + k), -5e3, 300.0])) for k, one in enumerate(near)], "ceres")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["guarded", "ceres+embedded", "nielsen+refine2"])
 def test_rows_are_solved_among_many_as_alone_by_any_policy(policy, small):
-    assert_as_alone(problems_of(["control_point", "distance", "baseline"], 4), policy)
+    assert_as_alone(problems_of(["control_point", "baseline"], 4), policy)
 
 
 @pytest.mark.slow
@@ -110,7 +121,7 @@ def test_rows_of_any_residual_end_the_same_on_several_lanes(name):
 @pytest.mark.parametrize("name", [*READY_MADE, OWN])
 def test_rows_of_any_residual_are_solved_on_several_devices_as_on_one(name, linear_solver):
     (problem,) = problems_of([name], 1)
-    options = replace(OPTIONS, linear_solver=linear_solver)
+    options = replace(OPTIONS, linear_solver=linear_solver, conjugate_gradients=EXACT)
     several = jaxba.solve(problem, "ceres", replace(options, devices=DEVICES))
     assert_alike(several, jaxba.solve(problem, "ceres", options))
 
@@ -119,12 +130,13 @@ def test_rows_of_any_residual_are_solved_on_several_devices_as_on_one(name, line
 @pytest.mark.parametrize("name", [*READY_MADE, OWN])
 def test_rows_of_any_residual_are_solved_in_parts_as_whole(name, monkeypatch, request):
     (problem,) = problems_of([name], 1)
-    whole = jaxba.solve(problem, "ceres", IMPLICIT)
+    options = replace(OPTIONS, linear_solver="implicit", conjugate_gradients=EXACT)
+    whole = jaxba.solve(problem, "ceres", options)
     request.getfixturevalue("in_parts")
-    shards = set_up(problem, "ceres", IMPLICIT, in_parts=True).shards
+    shards = set_up(problem, "ceres", options, in_parts=True).shards
     assert shards is not None
     assert shards.in_parts
-    assert_alike(jaxba.solve(problem, "ceres", IMPLICIT), whole)
+    assert_alike(jaxba.solve(problem, "ceres", options), whole)
 
 
 @pytest.mark.slow
