@@ -28,6 +28,10 @@ BETTER, LEAST_LEFT = 0.1, 4
 """Pixels of other photos are taken for the true ones if they leave this share of the misfit, with so many numbers more
 than the marks have."""
 
+ENOUGH = 100_000  # observations of which a median is taken
+
+MANY = 0.1  # share of the pixels which lie outside that typing errors do not explain
+
 UPRIGHT = 0.9  # share of a difference along z from which it is one of heights
 
 SAME = 0.3  # spread of differences over their median, below which all places are moved alike
@@ -54,27 +58,35 @@ def outside(clicks: Clicks, sigma: float) -> Bool[np.ndarray, " pixels"]:
 
 
 def outside_text(clicks: Clicks, out: Bool[np.ndarray, " pixels"], names: list[str], images: tuple[str, ...]) -> str:
-    """Which marks lie outside of which images, with the sizes of these."""
+    """Which marks lie outside of which images, with the sizes of these. Raises ValueError: this, if they are many."""
     first = int(np.argmax(out))
     width, height = clicks.sizes[first].tolist()
     others = int(out.sum()) - 1
     more = f", and {others} more" if others else ""
     name, image = names[clicks.mark[first]], images[clicks.image[first]]
-    return f"pixels of {name} lie outside of {image} ({width:g} x {height:g}){more}: photos of another size?"
+    text = f"pixels of {name} lie outside of {image} ({width:g} x {height:g}){more}: photos of another size, or turned?"
+    if out.sum() > max(1, MANY * len(out)):
+        raise ValueError(text)
+    return text
 
 
-def check_pixels(
-    where: str,
+def say(where: str, texts: list[str], strict: bool) -> None:
+    """Notes what does not fit; `where` is file and key. Raises ValueError: the first text, if `strict`."""
+    if texts and strict:
+        raise ValueError(texts[0])
+    report([f"{where}: {text}" for text in texts])
+
+
+def pixels_texts(
     problem: BundleProblem,
     clicks: Clicks,
     names: tuple[str, ...],
     sigma: float,
     observed: Callable[[np.ndarray], np.ndarray],
-) -> None:
-    """Notes marks whose rays do not meet.
+) -> list[str]:
+    """Which marks have rays that do not meet, in one line or none.
 
     Args:
-        where: file and key, for the note.
         problem: with the marks as its last points, where their rays meet best.
         clicks: their pixels.
         names: of the marks.
@@ -82,10 +94,10 @@ def check_pixels(
         observed: what makes observations of a problem of pixels.
 
     Raises:
-        ValueError: the pixels are those of photos of another size, or on their side; one line."""
+        ValueError: the pixels are those of photos of another size, or turned; one line."""
     first = problem.num_points - len(names)
     alone = np.asarray(problem.point_index) >= first
-    ties = problem.subset(~alone)
+    ties = problem.subset(_some(np.flatnonzero(~alone)))
     apart = np.asarray(ties.observations) - geometry.project(ties)
     noise = max(sigma, 1.4826 * float(np.median(np.abs(apart)))) if len(apart) else sigma
     marks = problem.subset(alone, points=np.arange(first, problem.num_points))
@@ -95,7 +107,7 @@ def check_pixels(
     rms = np.sqrt(total / np.maximum(2 * count - 3, 1))
     wrong = np.flatnonzero(~(rms <= MISFIT * noise))
     if not len(wrong):
-        return
+        return []
     left = 2 * len(clicks.pixels) - 3 * len(names) - 1
     if left >= LEAST_LEFT and len(wrong) > 1:
         _refuse_other_photos(marks, clicks, observed, noise)
@@ -103,12 +115,15 @@ def check_pixels(
     largest = int(np.argmax(np.where(marks.point_index == wrong[0], squares, -1)))
     image = problem.labels.names[clicks.image[largest]] if problem.labels is not None else ""
     listed = names_of([f"{names[at]} ({rms[at]:.3g})" for at in wrong.tolist()])
-    report(
-        [
-            f"{where}: rays of the same point do not meet, by pixels (RMS): {listed}; those of {names[wrong[0]]} least "
-            f"in {image}. The pixels are said to be accurate to {sigma:g}"
-        ]
-    )
+    return [
+        f"rays of the same point do not meet, by pixels (RMS): {listed}; those of {names[wrong[0]]} least in {image}. "
+        f"The pixels are said to be accurate to {sigma:g}"
+    ]
+
+
+def _some(at: Int[np.ndarray, " n"]) -> Int[np.ndarray, " some"]:
+    """At most about `ENOUGH` of some observations, evenly."""
+    return at[:: max(1, len(at) // ENOUGH)]
 
 
 def _apart(marks: BundleProblem) -> Float[np.ndarray, "pixels 2"]:
@@ -141,11 +156,12 @@ def _refuse_other_photos(
         "on their other side": np.stack([width - y, x], axis=1),
         "upside down": np.stack([width - x, height - y], axis=1),
         "whose y goes up": np.stack([x, height - y], axis=1),
+        "whose x and y are swapped": np.stack([y, x], axis=1),
     }
     bound = BETTER * given
     for what, pixels in turned.items():
         if misfit(pixels) < min(bound, MISFIT * noise):
-            raise ValueError(f"the pixels seem to be those of photos {what}: they fit if they are turned")
+            raise ValueError(f"the pixels seem to be those of photos {what}: they fit if this is undone")
     misfits = [scaled(size) for size in SIZES]
     best = int(np.argmin(misfits))
     if not misfits[best] < 0.5 * given:
@@ -162,7 +178,7 @@ def _refuse_other_photos(
         )
 
 
-def places_text(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "marks 3"]) -> str:
+def places_texts(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "marks 3"]) -> list[str]:
     """How measured places of marks differ from where a scene that measured positions placed has them.
 
     Args:
@@ -171,7 +187,7 @@ def places_text(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "ma
         met: where the rays of their pixels meet.
 
     Returns:
-        One line; empty if they do not differ, or noise or a bent scene explains it."""
+        One line, or none if they do not differ, or noise or a bent scene explains it."""
     away = met - marks.places
     around = np.concatenate([np.asarray(problem.points), geometry.camera_centers(problem.cameras)])
     bound = max(BENDS * extent_of(around), MISFIT * _deviation_of_positions(problem))
@@ -183,16 +199,16 @@ def places_text(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "ma
         axes = ", ".join(f"{axis} {number:.3g}" for axis, number in zip("xyz", shift.tolist(), strict=True))
         upright = abs(shift[2]) > UPRIGHT * moved
         what = "heights above the ellipsoid and above the geoid, or of two units?" if upright else "two frames?"
-        return f"the points lie {moved:.3g} from where position_priors have them, all alike ({axes}): {what}"
+        return [f"the points lie {moved:.3g} from where position_priors have them, all alike ({axes}): {what}"]
     if np.median(distance) > bound:
         half = f"half of them by {np.median(distance):.3g} or more"
-        return f"the points do not lie where position_priors have them, {half}: another frame, or other axes or units?"
+        return [f"the points do not lie where position_priors have them, {half}: another frame, axes or units?"]
     covariances = marks.stddev[:, :, None] ** 2 * np.eye(3)
     wrong = wrong_places(marks.places, away, covariances)
     wrong = wrong[distance[wrong] > bound]
     if not len(wrong):
-        return ""
-    return f"points are not where the scene has them: {wrong_text(marks.names.__getitem__, wrong, away, covariances)}"
+        return []
+    return [f"points are not where the scene has them: {wrong_text(marks.names.__getitem__, wrong, away, covariances)}"]
 
 
 def _deviation_of_positions(problem: BundleProblem) -> float:

@@ -20,7 +20,7 @@ from jaxba.io.position_tables import Positions
 from jaxba.io.positions import read_database, read_file, read_photos
 from jaxba.io.tables import has_fix
 from jaxba.model.registration import with_residual
-from jaxba.problem.alignment import alignment, check_axes, misfit_text
+from jaxba.problem.alignment import alignment, check_axes, misfit_texts
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP, camera_centers
 from jaxba.problem.hold import every_lens
@@ -142,9 +142,7 @@ def with_control_points(
     clicks = marks_fit.Clicks(image, given.point[kept], given.pixels[kept], sizes[image])
     if (out := marks_fit.outside(clicks, sigma)).any():
         text = marks_fit.outside_text(clicks, out, given.names, problem.labels.names)
-        if strict:
-            raise ValueError(text)
-        report([f"{where}: {text} They are left out"])
+        marks_fit.say(where, [f"{text} They are left out"], strict)
         clicks = clicks.of(~out)
     placed = has_fix(given.places, crs != "" and is_geographic(crs))
     images = np.bincount(clicks.mark, minlength=len(given.names))
@@ -184,8 +182,10 @@ def with_control_points(
 
     problem = with_marks(problem, clicks.image, clicks.mark, observed(clicks.pixels), sigma, names)
     problem = _where_rays_meet(problem, len(names))
-    marks_fit.check_pixels(where, problem, clicks, names, sigma, observed)
-    return _on_marks(where, problem, marks, values.parse_loss(value), align), marks
+    marks_fit.say(where, marks_fit.pixels_texts(problem, clicks, names, sigma, observed), strict)
+    problem, notes = _on_marks(problem, marks, values.parse_loss(value), align)
+    marks_fit.say(where, notes, strict)
+    return problem, marks
 
 
 def _where_rays_meet(problem: BundleProblem, count: int) -> BundleProblem:
@@ -197,37 +197,29 @@ def _where_rays_meet(problem: BundleProblem, count: int) -> BundleProblem:
     return problem.replace(points=np.concatenate([np.asarray(problem.points)[:first], met]))
 
 
-def _on_marks(where: str, problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> BundleProblem:
-    """The problem with rows of the control points among its marks, moved to these if nothing else placed it.
-
-    Args:
-        where: file and key, for notes.
-        problem: with the marks as its last points.
-        marks: these.
-        loss: of the rows.
-        align: whether the problem may be moved, and what does not fit before the solve is said."""
+def _on_marks(problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> tuple[BundleProblem, list[str]]:
+    """The problem with rows of the control points among its marks, moved to these if nothing else placed it, and what
+    does not fit before the solve, if `align`. The marks are its last points."""
     first = problem.num_points - len(marks.names)
     control = np.flatnonzero(~marks.check)
     met = np.asarray(problem.points)[first:]
     covariances = marks.stddev[:, :, None] ** 2 * np.eye(3)
-    notes = []
+    notes: list[str] = []
     if align and problem.residuals:
-        notes.append(marks_fit.places_text(problem, marks, met))
+        notes += marks_fit.places_texts(problem, marks, met)
     elif align and len(control):
         planar = check_axes(met, marks.places, covariances)
         fit, chi = alignment(met[control], marks.places[control], covariances[control])
         problem = transformed(problem, fit)
         away = fit.points(met[control]) - marks.places[control]
         names = [marks.names[at] for at in control]
-        notes.append(misfit_text(names.__getitem__, "points", away, marks.places[control], covariances[control], chi))
-        if planar and on_its_head(problem):
-            notes.append(ON_ITS_HEAD)
-    report([f"{where}: {text}" for text in notes if text])
+        notes += misfit_texts(names.__getitem__, "points", away, marks.places[control], covariances[control], chi)
+        notes += [ON_ITS_HEAD] if planar and on_its_head(problem) else []
     if not len(control):
-        return problem
+        return problem, notes
     whitening = np.eye(3) / marks.stddev[control][:, None]
     rows = residuals.control_point(point=first + control, position=marks.places[control], whitening=whitening)
-    return with_residual(problem, rows, loss=loss)
+    return with_residual(problem, rows, loss=loss), notes
 
 
 def _crs(value: dict[str, Any]) -> str:

@@ -14,9 +14,9 @@ from jaxba.problem.labels import part_name
 from jaxba.problem.misfit import BENDS, MISFIT, extent_of, off_by, wrong_places, wrong_text
 from jaxba.problem.similarity import Similarity, along_line, transformed, umeyama
 
-STARTS, ROUNDS, KEPT = 20, 10, 0.5
-"""Starts of a robust alignment, the rounds of each, and the share of the images that these keep: it stands half of the
-positions wrong. Of so many starts with three images all have a wrong one in 1 of 300, where a third are wrong."""
+STARTS, ROUNDS, KEPT, COMPARED = 20, 10, 0.5, 2 / 3
+"""Starts of a robust alignment, the rounds of each, the share of the images that these keep, and that by which ends are
+compared: it stands a third of the positions wrong, of which all starts have one in 1 of 300."""
 
 SIGNIFICANT = 3.0
 """Standard deviations by which positions must spread in a direction before they say anything about scale or rotation:
@@ -63,21 +63,20 @@ def aligned(
     def name(at: int) -> str:
         return part_name(problem.labels, "image", int(images[at]))
 
-    text = misfit_text(name, "images", best.points(centers) - positions, positions, covariances, chi)
-    if text:
+    for text in misfit_texts(name, "images", best.points(centers) - positions, positions, covariances, chi):
         _note(text)
     return transformed(problem, best)
 
 
-def misfit_text(
+def misfit_texts(
     name: Callable[[int], str],
     kind: str,
     away: Float[np.ndarray, "n 3"],
     positions: Float[np.ndarray, "n 3"],
     covariances: Float[np.ndarray, "n 3 3"],
     chi: float,
-) -> str:
-    """Which measured positions the aligned scene does not have, or that many do not fit; empty if they do.
+) -> list[str]:
+    """Which measured positions the aligned scene does not have, or that many do not fit; none if they do.
 
     Args:
         name: what a position is of.
@@ -91,30 +90,32 @@ def misfit_text(
     most = float(np.quantile(distance, MOST))
     if chi > MISFIT and most > BENDS * extent_of(positions):
         farthest = wrong if len(wrong) else np.argsort(-distance)
-        return (
+        return [
             f"a quarter of the {kind} of the aligned scene are {most:.3g} or more from their positions, {chi:.3g} "
             f"times what the standard deviations explain: {wrong_text(name, farthest, away, covariances)}"
-        )
+        ]
     if len(wrong):
-        return f"measured positions do not fit the others: {wrong_text(name, wrong, away, covariances)}"
-    return ""
+        return [f"measured positions do not fit the others: {wrong_text(name, wrong, away, covariances)}"]
+    return []
 
 
 def check_axes(
     places: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
 ) -> bool:
-    """Whether measured positions fit places of a scene as well if an axis is mirrored, as those in a plane do.
+    """Whether measured positions fit places of a scene, and as well if an axis is mirrored, as those in a plane do.
 
     Raises ProblemError: they fit well with other axes or units only."""
     best, _ = _robust_fit(places, positions, covariances)
-    mirrored = positions * [-1, 1, 1]
-    other, _ = _robust_fit(places, mirrored, covariances * _MIRRORED)
-    misfit = float(np.max(_distances(best, places, positions, covariances)))
+    away, sigmas = off_by(best.points(places) - positions, covariances)
+    misfit = float(sigmas.max())
     if misfit > DOUBTFUL * NEARLY_ALL:
         _refuse_other_axes(places, positions)
-    return float(np.max(_distances(other, places, mirrored, covariances * _MIRRORED))) < DOUBTFUL * max(
-        misfit, NEARLY_ALL
-    )
+    if away.max() > BENDS * extent_of(positions):
+        return False
+    mirrored = positions * [-1, 1, 1]
+    turned = covariances * _MIRRORED
+    other, _ = _robust_fit(places, mirrored, turned)
+    return float(np.max(_distances(other, places, mirrored, turned))) < DOUBTFUL * max(misfit, NEARLY_ALL)
 
 
 def alignment(
@@ -155,7 +156,7 @@ def _robust_fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndar
             fit, _ = _fit(centers[kept], positions[kept], covariances[kept])
             distance = _distances(fit, centers, positions, covariances)
             kept = np.argsort(distance)[: max(3, int(np.ceil(KEPT * count)))]
-        nearest = float(np.sort(distance)[: int(np.ceil(MOST * count))].sum())
+        nearest = float(np.sort(distance)[: int(np.ceil(COMPARED * count))].sum())
         if best is None or nearest < least:  # of more than half: that may lie on a line, and others not
             best, least = distance, nearest
     assert best is not None

@@ -49,9 +49,12 @@ def scaled(survey: Survey, size: float) -> None:
     survey.mark_pixels = survey.mark_pixels * size
 
 
-def on_their_side(survey: Survey) -> None:
-    x, y = np.moveaxis(survey.mark_pixels, -1, 0)
-    survey.mark_pixels = np.stack([survey.size[1] - y, x], axis=-1)
+def upside_down(survey: Survey) -> None:
+    survey.mark_pixels = np.array(survey.size) - survey.mark_pixels
+
+
+def y_up(survey: Survey) -> None:
+    survey.mark_pixels[..., 1] = survey.size[1] - survey.mark_pixels[..., 1]
 
 
 def test_marks_that_fit_get_no_note(said, facade):
@@ -67,9 +70,10 @@ def test_marks_of_resized_photos_are_refused_with_both_sizes(said, facade, size)
         said(facade, lambda survey: scaled(survey, size))
 
 
-def test_marks_of_photos_on_their_side_are_refused(said, facade):
-    with pytest.raises(ProblemError, match="those of photos on their side"):
-        said(facade, on_their_side)
+@pytest.mark.parametrize(("change", "what"), [(upside_down, "upside down"), (y_up, "whose y goes up")])
+def test_marks_of_turned_photos_are_refused(said, facade, change, what):
+    with pytest.raises(ProblemError, match=f"those of photos {what}"):
+        said(facade, change)
 
 
 def test_a_wrong_click_is_named_with_its_image(said, facade):
@@ -87,7 +91,7 @@ def test_pixels_outside_of_their_image_are_left_out(said, facade):
 
     image = facade.names[facade.mark_seen[2, 0]]
     (note,) = said(facade, change)
-    assert f"pixels of gcp3 lie outside of {image} (6000 x 4000): photos of another size?" in note
+    assert f"pixels of gcp3 lie outside of {image} (6000 x 4000): photos of another size, or turned?" in note
 
 
 def test_pixels_outside_of_their_image_are_refused_where_all_must_fit(said, facade):
@@ -124,3 +128,16 @@ def test_a_typo_in_a_control_point_is_named_before_the_solve(said, block):
 
     (note,) = said(block, change)
     assert "points are not where the scene has them: gcp5 is 40" in note
+
+
+def test_pixels_most_of_which_lie_outside_are_refused(said, facade):
+    with pytest.raises(ProblemError, match=r"lie outside of .* \(6000 x 4000\), and \d+ more: photos of another size"):
+        said(facade, lambda survey: scaled(survey, 3.0))
+
+
+def test_a_wrong_click_is_refused_where_all_must_fit(said, facade):
+    def change(survey: Survey) -> None:
+        survey.mark_pixels[3, 1] += [25.0, 10.0]
+
+    with pytest.raises(ProblemError, match=r"survey.yaml: control_points: rays of the same point do not meet"):
+        said(facade, change, strict=True)
