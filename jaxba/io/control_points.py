@@ -49,6 +49,8 @@ def read_control_points(path: StrPath) -> ControlPoints:
     for number, line in given:
         where = f"{file} line {number}"
         words = _words(line)
+        if number == given[0][0] and not any(map(is_value, words)):
+            continue  # names of columns
         if len(words) <= len(FIELDS):
             raise ProblemError(f"{where}: has {len(words)} words, not x y z px py image [name]")
         *place, x, y = (value_of(word, field, where) for word, field in zip(words, FIELDS, strict=False))
@@ -65,6 +67,8 @@ def read_control_points(path: StrPath) -> ControlPoints:
         point.append(at)
         images.append(words[5])
         pixels.append([x, y])
+    if not images:
+        raise ProblemError(f"{file}: has no points")
     crs = "" if first.lower() == LOCAL else system_of(first) or first
     return ControlPoints(crs, list(names), np.array(places), np.array(point), images, np.array(pixels))
 

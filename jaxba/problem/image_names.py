@@ -6,12 +6,10 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 _DRIVE = re.compile(r"^[A-Za-z]:")
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{0,4}$")
-
-Other = TypeVar("Other")
 
 
 class NamedImages(NamedTuple):
@@ -70,28 +68,22 @@ def _match(
         names: those of the images.
         form: what parts of paths are compared by.
         positions: images of names so far."""
-    paths_of = {name: _path(name, form) for name in {*wanted, *names}}
-    called: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
-    for at, name in enumerate(names):
-        called[paths_of[name][-1:]].append(at)
-    asked: defaultdict[tuple[str, ...], list[str]] = defaultdict(list)
-    for name in wanted:
-        asked[paths_of[name][-1:]].append(name)
+    images = _Paths([_path(name, form) for name in names])
+    asked = _Paths([_path(name, form) for name in wanted])
     doubts = {}
     given = set(positions.values())
     for name in rest:
-        own = paths_of[name]
-        images = _nearest(own, called[own[-1:]], lambda at: paths_of[names[at]])
-        if len(images) > 1:
-            doubts[name] = _doubt([names[at] for at in images], last_part(name))
-        if len(images) != 1 or images[0] in given:
+        nearest = images.nearest(_path(name, form))
+        if len(nearest) > 1:
+            doubts[name] = _doubt([names[at] for at in nearest], last_part(name))
+        if len(nearest) != 1 or nearest[0] in given:
             continue
-        other = paths_of[names[images[0]]]
-        same = _nearest(other, asked[other[-1:]], lambda one: paths_of[one])
+        image = nearest[0]
+        same = [wanted[at] for at in asked.nearest(images.paths[image])]
         if same == [name]:
-            positions[name] = images[0]
+            positions[name] = image
         elif name in same:
-            doubts[name] = _doubt(same, names[images[0]])
+            doubts[name] = _doubt(same, names[image])
     return doubts
 
 
@@ -100,23 +92,24 @@ def _doubt(names: Sequence[str], called: str) -> str:
     return f"{names[0]} and {names[1]}{more} may both be {called}: give more of the path"
 
 
-def _nearest(
-    path: tuple[str, ...], others: Sequence[Other], path_of: Callable[[Other], tuple[str, ...]]
-) -> list[Other]:
-    """Those of others whose paths have most of a path in common, from its end."""
-    shared = [_shared(path, path_of(other)) for other in others]
-    most = max(shared, default=(0, False))
-    return [other for other, count in zip(others, shared, strict=True) if count == most]
+class _Paths:
+    """Paths, by what they end in."""
 
+    def __init__(self, paths: Sequence[tuple[str, ...]]):
+        self.paths = paths
+        self._ending: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
+        for at, path in enumerate(paths):
+            for first in range(len(path)):
+                self._ending[path[first:]].append(at)
 
-def _shared(path: tuple[str, ...], other: tuple[str, ...]) -> tuple[int, bool]:
-    """How many parts two paths share from their ends, and whether they are all."""
-    count = 0
-    for part, same in zip(reversed(path), reversed(other), strict=False):
-        if part != same:
-            break
-        count += 1
-    return count, len(path) == len(other) == count
+    def nearest(self, path: tuple[str, ...]) -> list[int]:
+        """Those that have most of a path in common, from its end; of these the path itself, if it is there."""
+        for first in range(len(path)):
+            alike = self._ending.get(path[first:], [])
+            if alike:
+                same = [at for at in alike if self.paths[at] == path]
+                return same or alike
+        return []
 
 
 def _path(name: str, form: Callable[[str], str]) -> tuple[str, ...]:

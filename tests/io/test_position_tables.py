@@ -171,7 +171,9 @@ CONTROL = {
 
 @pytest.mark.parametrize("form", CONTROL)
 def test_control_points_of_other_programs_are_read(form, tmp_path):
-    (tmp_path / "gcp_list.txt").write_text(f"WGS84 UTM 33N\n{line_of(CONTROL[form], '', UTM[0])}\n")
+    (tmp_path / "gcp_list.txt").write_text(
+        f"WGS84 UTM 33N\nx y z im_x im_y image_name gcp_name\n{line_of(CONTROL[form], '', UTM[0])}\n"
+    )
     found = read_control_points(tmp_path / "gcp_list.txt")
     assert (found.crs, found.names, found.images) == ("EPSG:32633", ["gcp1"], ["IMG 1.JPG"])
     assert (found.places.tolist(), found.pixels.tolist()) == ([UTM[0]], [[4.5, 5.5]])
