@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxba.io.accuracies import KINDS, Accuracies, covariances_of, kind_of_accuracy, may_be_accuracy
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.geodesy import NOT_SAID, system_of
@@ -19,8 +19,7 @@ WGS84 = "EPSG:4326"  # what longitudes and latitudes are of, if nothing else is 
 
 WORDS = {
     "name": "image images imagename imagefile imagefilename imagepath photo photos photoname photofile file filename "
-    "filepath label name sourcefile cameralabel cameraname "
-    "bild bildname foto",
+    "filepath label name sourcefile cameralabel cameraname bild bildname foto",
     "x": "x easting east e xeasting eastingx geox coordx xcoord xcoordinate utmx utmeasting rechtswert",
     "y": "y northing north n ynorthing northingy geoy coordy ycoord ycoordinate utmy utmnorthing hochwert",
     "longitude": "longitude lon lng long gpslongitude xlongitude longitudex geolon",
@@ -32,20 +31,6 @@ WORDS = {
     "sz": "vertical",
 }
 """Names of the columns of a table, in letters alone and without units."""
-
-ACCURACY = "accuracy acc sigma stddev stdev std sd s precision rms rmse uncertainty"
-"""What accuracies are called, before or after what they are of."""
-
-DIRECTIONS = {
-    "sx": "x e east easting lon long longitude",
-    "sy": "y n north northing lat latitude",
-    "sxy": "xy h hor horz horiz horizontal lateral planimetric",
-    "sz": "z v ver vert vertical u up height hgt alt altitude elevation elev",
-    "s": "xyz d position",  # d: of 3d
-}
-"""What accuracies are of, by what `Layout` calls these."""
-
-ACCURACIES = ("sx", "sy", "sxy", "sz", "s")
 
 WITHOUT_NAMES = {
     2: ("x", "y"),
@@ -59,14 +44,7 @@ WITHOUT_NAMES = {
 """What follows a name in lines without names of columns, by the number of columns. Source: OpenDroneMap's `geo.txt`
 (docs.opendronemap.org/geo); three angles or three numbers more are also what Pix4D writes."""
 
-VERTICAL = 2.0
-"""Standard deviation of heights over the horizontal one where it is not known: of RTK 15 mm against 8, of a phone 1.5
-to 3 times (data sheets of receivers)."""
-
 LARGEST_SHARE = 0.01  # extent of positions in degrees, over their distance from 0, 0: metres of a scene are not so far
-
-_MAYBE = re.compile(r"accura|sigma|std|uncertain|precision")
-_ANGLES = re.compile(r"yaw|pitch|roll|omega|phi|kappa|heading|attitude|rotation|angle|deg")
 
 
 class Positions(NamedTuple):
@@ -120,7 +98,7 @@ def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Position
     axes = ("longitude", "latitude", "height") if degrees else ("x", "y", "height")
     if missing := [axis for axis in ("name", *axes) if axis not in column]:
         raise ProblemError(f"{file} line {max(layout.first, 1)}: there is no column {missing[0]}")
-    known = [what for what in ACCURACIES if what in column]
+    known = [what for what in KINDS if what in column]
     names, places, given = [], [], []
     for number, line in enumerate(lines[layout.first :], layout.first + 1):
         cells = _row(line, layout)
@@ -139,8 +117,12 @@ def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Position
     if degrees:
         turns = [1.0 if np.isnan(unit) else unit for unit in units[:2]]
         places = (np.array(places) * [*turns, 1.0]).tolist()
-    cells_by_kind = {what: [row[at] for row in given] for at, what in enumerate(known)}
-    covariances, notes = _covariances(cells_by_kind, layout, names, file)
+    accuracies = [
+        Accuracies(what, column[what].title, column[what].unit, [row[at] for row in given])
+        for at, what in enumerate(known)
+    ]
+    there = np.asarray(np.isfinite(np.array(places)).all(axis=1))
+    covariances, notes = covariances_of(accuracies, layout.unused, names, there, file)
     crs = layout.crs or (WGS84 if degrees else "")
     return Positions(names, np.array(places), covariances, crs, (units[0], units[2]), notes, degrees)
 
@@ -159,27 +141,18 @@ def _with_names(lines: Sequence[str]) -> Layout | None:
 
 def _named(titles: Sequence[str]) -> tuple[dict[str, Column], tuple[str, ...]]:
     """The column of each thing that a line of names has, and titles of those that may be accuracies."""
-    known = _known_names()
+    known = {word: what for what, words in WORDS.items() for word in words.split()}
     columns: dict[str, Column] = {}
     unused = []
     for at, title in enumerate(titles):
         name, unit = title_of(title)
-        if name in known:
-            columns.setdefault(known[name], Column(at, title, unit))
-        elif _MAYBE.search(name) and not _ANGLES.search(title.lower()):
+        accuracy = kind_of_accuracy(name)
+        what = known.get(name) or accuracy
+        if may_be_accuracy(title, accuracy):
             unused.append(title)
+        elif what:
+            columns.setdefault(what, Column(at, title, unit))
     return columns, tuple(unused)
-
-
-def _known_names() -> dict[str, str]:
-    """What columns have, by the letters of their names."""
-    known = {word: what for what, words in WORDS.items() for word in words.split()}
-    for what, directions in DIRECTIONS.items():
-        for accuracy in ACCURACY.split():
-            for direction in directions.split():
-                named = [f"{accuracy}{direction}", *([f"{direction}{accuracy}"] if accuracy != "s" else [])]
-                known |= {before + name: what for name in named for before in ("", "rtk", "gps", "gnss")}
-    return known | {accuracy: "s" for accuracy in ACCURACY.split()}
 
 
 def _without_names(lines: Sequence[str], file: str, crs_is_geographic: bool | None) -> Layout:
@@ -230,61 +203,3 @@ def _values(cells: Sequence[str]) -> list[float]:
     """The values with which cells begin."""
     count = next((at for at, cell in enumerate(cells) if not is_value(cell)), len(cells))
     return [value_of(cell, "value", "") for cell in cells[:count]]
-
-
-def _covariances(
-    cells: dict[str, list[str]], layout: Layout, names: Sequence[str], file: str
-) -> tuple[Float[np.ndarray, "n 3 3"] | None, tuple[str, ...]]:
-    """Covariances by what a table has of accuracies, and notes on what they get where it has none."""
-    notes, usable = [], {}
-    unused = list(layout.unused)
-    for what, column in cells.items():
-        unit = layout.columns[what].unit
-        deviations = np.array([_accuracy(cell) for cell in column]) * (1.0 if np.isnan(unit) else unit)
-        if np.isfinite(deviations).any():
-            usable[what] = deviations
-        else:
-            unused.append(layout.columns[what].title)
-    if unused:
-        columns = f"column{'s' * (len(unused) > 1)} {', '.join(unused)}"
-        notes.append(f"{file}: the accuracies in {columns} are not used")
-    if not usable:
-        return None, tuple(f"{note}: the standard deviation is 1" for note in notes)
-    of_axes = (("sx", "sxy", "s", "sy"), ("sy", "sxy", "s", "sx"), ("sz", "s"))
-    table = np.full((len(names), len(of_axes)), np.nan)
-    for axis, kinds in enumerate(of_axes):
-        for kind in reversed(kinds):
-            if kind in usable:
-                table[:, axis] = usable[kind]
-    return _complete(table, names, file, notes)
-
-
-def _accuracy(cell: str) -> float:
-    """A positive number, or NaN."""
-    number = value_of(cell, "accuracy", "") if is_value(cell) else np.nan
-    return number if number > 0 else np.nan
-
-
-def _complete(
-    deviations: Float[np.ndarray, "n 3"], names: Sequence[str], file: str, notes: list[str]
-) -> tuple[Float[np.ndarray, "n 3 3"], tuple[str, ...]]:
-    """Covariances of standard deviations some of which are not known (NaN), with notes on these."""
-    known = np.asarray(np.isfinite(deviations).any(axis=0))
-    if not known[2]:
-        deviations = np.column_stack([deviations[:, :2], VERTICAL * deviations[:, :2].max(axis=1)])
-        notes.append(f"{file}: no accuracy of heights: they get {VERTICAL:g} times the horizontal one")
-    elif not known[:2].any():
-        deviations = np.repeat(deviations[:, 2:], 3, axis=1)
-        notes.append(f"{file}: no horizontal accuracy: positions get that of heights")
-    missing = ~np.isfinite(deviations)
-    deviations = np.where(missing, np.nanmax(deviations, axis=0), deviations)
-    if missing.any():
-        notes.append(without_accuracy([names[at] for at in np.flatnonzero(missing.any(axis=1)).tolist()], file))
-    return deviations[:, :, None] ** 2 * np.eye(3), tuple(notes)
-
-
-def without_accuracy(names: Sequence[str], file: str) -> str:
-    """The note on images whose accuracy is not known."""
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    images = f"{len(names)} image{'s' * (len(names) > 1)}"
-    return f"{file}: no accuracy of {images}, which get the largest of the others: {', '.join(names[:3])}{more}"

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxba.io.accuracies import without_accuracy
 from jaxba.io.files import StrPath, display_name, reason
 from jaxba.io.image_files import files_of_images
 from jaxba.io.json_records import Record, read_json
 from jaxba.io.nerfstudio import IMAGES
-from jaxba.io.position_tables import WGS84, Positions, read_table, without_accuracy
+from jaxba.io.position_tables import WGS84, Positions, read_table
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
 

@@ -94,6 +94,7 @@ def test_units_are_those_of_the_names_of_columns(title, units, tmp_path):
         ("accuracy_horizontal", ["1", "2", "3"], [[1, 1, 2], [2, 2, 4], [3, 3, 6]], "they get 2 times the horizontal"),
         ("accuracy_vertical", ["1", "2", "3"], [[1] * 3, [2] * 3, [3] * 3], "positions get that of heights"),
         ("accuracy class", ["1", "2", "3"], None, "accuracies in column accuracy class are not used: .* is 1$"),
+        ("sigma lat [deg]", ["1", "2", "3"], None, r"accuracies in column sigma lat \[deg\] are not used: .* is 1$"),
         ("accuracy", ["fixed", "float", ""], None, "accuracies in column accuracy are not used: .* is 1$"),
     ],
 )
