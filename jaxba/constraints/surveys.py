@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -219,7 +220,7 @@ def _on_marks(problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> 
         return problem, notes
     whitening = np.eye(3) / marks.stddev[control][:, None]
     rows = residuals.control_point(point=first + control, position=marks.places[control], whitening=whitening)
-    return with_residual(problem, rows, loss=loss), notes
+    return with_residual(problem, replace(rows, aligned=True), loss=loss), notes
 
 
 def _crs(value: dict[str, Any]) -> str:

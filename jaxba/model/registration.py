@@ -7,7 +7,7 @@ import hashlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,19 +86,30 @@ def costs_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, " rows"]]:
 def residuals_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, "rows size"]]:
     """What the functions return for every row of `problem.residuals.rows`, without the losses."""
     with numerics(np.float64):
-        kinds, of, at = _rows_of(problem)
+        kinds, of, at, _ = rows_of(problem)
         values = program(model.values, level="quick")
         return [np.asarray(values(kind, of, *at)).T for kind in kinds]
 
 
-def _rows_of(problem: BundleProblem) -> tuple[tuple[ResidualSlots, ...], Unknowns, tuple[jax.Array, jax.Array]]:
+class LaidRows(NamedTuple):
+    """Rows of all residuals of a problem, and what their functions need."""
+
+    kinds: tuple[ResidualSlots, ...]
+    unknowns: Unknowns
+    parameters: tuple[jax.Array, jax.Array]  # of cameras, by their numbers, and of points
+    groups: tuple[np.ndarray, ...]  # for each block of residuals the row that each camera has; negative for none
+
+
+def rows_of(problem: BundleProblem) -> LaidRows:
     """Rows of all residuals, and cameras and points as their functions need them."""
-    here = laid_out(in_frames(problem))
-    every, seen = np.arange(here.num_points), np.bincount(here.camera_index, minlength=here.num_cameras) > 0
-    of = unknowns_of(here, seen, every, fixed=False, agreement=ALONE)
-    rows = np.arange(here.num_observations)
-    kinds = residual_slots(here, rows, rows, every, ALONE)
-    return kinds, of, (jnp.asarray(here.cameras.T), jnp.asarray(here.points.T))
+    laid = laid_out(in_frames(problem))
+    points = np.arange(laid.num_points)
+    seen = np.bincount(laid.camera_index, minlength=laid.num_cameras) > 0
+    unknowns = unknowns_of(laid, seen, points, fixed=False, agreement=ALONE)
+    slots = np.arange(laid.num_observations)
+    kinds = residual_slots(laid, slots, slots, points, ALONE)
+    parameters = jnp.asarray(laid.cameras.T), jnp.asarray(laid.points.T)
+    return LaidRows(kinds, unknowns, parameters, tuple(map(np.asarray, laid.residuals.groups)))
 
 
 def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residual]:
@@ -107,7 +118,7 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residua
     with numerics(np.float64):
         problem = problem.replace(residuals=residuals)
         problem = shift(problem, -far_middle(problem))  # rounding and steps are those of a solve
-        (*_, kind), of, at = _rows_of(problem)
+        (*_, kind), of, at, _ = rows_of(problem)
         try:
             traced, shape = _traced(kind, of, at)
         except Exception as error:

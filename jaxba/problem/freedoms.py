@@ -49,11 +49,11 @@ def free_directions(
 
 
 def freedoms(
-    problem: BundleProblem,
+    problem: BundleProblem, *, of_rows: bool = True
 ) -> tuple[Float[np.ndarray, "7 directions"], np.ndarray, np.ndarray, np.ndarray, float]:
     """An orthonormal basis of the combinations of w, e and s (in this order) that are free; derivatives of poses by the
     seven, and of extrinsics in rigs, (cameras, numbers, 7), with lengths in extents and zero for what is constant;
-    which points move; the middle and the extent."""
+    which points move; the middle and the extent. Without `of_rows` residuals other than those of pixels fix nothing."""
     here, constants = in_frames(problem), problem.constants
     seen, points_move = observed(problem)
     middle, extent = middle_and_extent(problem)
@@ -72,7 +72,7 @@ def freedoms(
         held = np.asarray(constants.points) & points_move
         rows.append(_motions((np.asarray(problem.points)[held] - middle) / extent))
         points_move = points_move & ~held
-    rows += changes_by_similarity(problem, middle, extent)
+    rows += changes_by_similarity(problem, middle, extent) if of_rows else []
     staying = np.concatenate([part.reshape(-1, SIMILARITY) for part in rows])
     staying /= np.maximum(np.abs(staying).max(axis=1, keepdims=True), 1.0)  # far away small turns are large motions
     _, values, basis = np.linalg.svd(staying, full_matrices=False)

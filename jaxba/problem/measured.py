@@ -63,7 +63,7 @@ def with_position_priors(
             raise ProblemError("an alignment would move what is constant or measured: align first, or align=False")
         problem = aligned(problem, measured, covariances, at)
     rows = position_prior(pose=at, position=measured, whitening=roots)
-    return _with(problem, replace(rows, loss=loss or Loss(), size=3))
+    return _with(problem, replace(rows, loss=loss or Loss(), size=3, aligned=True))
 
 
 def with_rotation_priors(
@@ -77,7 +77,8 @@ def with_rotation_priors(
     measured = finite("rotations", rotations, (len(at), 3))
     whitening = AXES * _covariances(problem, "rotation", covariance, at)[1] * AXES[:, None]
     matrices = AXES[:, None] * rotation_matrices(measured)
-    return _with(problem, replace(rotation_prior(pose=at, rotation=matrices, whitening=whitening), size=3))
+    rows = rotation_prior(pose=at, rotation=matrices, whitening=whitening)
+    return _with(problem, replace(rows, size=3, aligned=True))
 
 
 def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> BundleProblem:
@@ -95,7 +96,8 @@ def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> Bundl
             raise ValueError(f"the standard deviation of {name} must be positive, is {deviation}")
         weight[number_columns(lenses, [name])] = 1 / deviation
     rows = lens_prior(lens=used, mean=mean, weight=weight[used])
-    return _with(problem.replace(lenses=lenses), replace(rows, size=mean.shape[1]))
+    rows = replace(rows, size=mean.shape[1], aligned=True)
+    return _with(problem.replace(lenses=lenses), rows)
 
 
 @residual

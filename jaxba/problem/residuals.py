@@ -168,6 +168,9 @@ class Rows(ArrayRecord):
     size: int = field(default=0, metadata={"static": True}, kw_only=True)
     """Numbers that the function returns; 0 before it is registered."""
 
+    aligned: bool = field(default=False, metadata={"static": True}, kw_only=True)
+    """Whether the scene has been moved to the frame of the rows, or must stay in the one that it has."""
+
     whole: tuple[str, ...] = field(default=(), metadata={"static": True}, kw_only=True)
     """Keywords whose array counts, whole, for each row; none once it is registered."""
 

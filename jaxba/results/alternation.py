@@ -16,9 +16,11 @@ from jaxba.results.retriangulate import Retriangulation, retriangulate_without
 from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.drivers import Callback, Watch
 from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
 from jaxba.solver.solve import Solution
+from jaxba.solver.start import as_measured
 
 MAX_ROUNDS = 5
 """Most retriangulations. Source: COLMAP, ba_global_max_refinements."""
@@ -51,6 +53,8 @@ def solve_and_retriangulate(
         watch: as for `solve`; iterations and seconds are counted over all solves.
         verbose: as for `solve`."""
     options = checked_options(options)
+    check_problem(problem)
+    problem = as_measured(problem)
     callback, waiting = shown(callback, verbose)
     away = set_aside(problem)
     solves = Consecutive(policy, callback, watch, waiting)

@@ -36,6 +36,7 @@ from jaxba.solver.place import NO_CAMERAS, check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
 from jaxba.solver.solve import Solution
+from jaxba.solver.start import as_measured
 
 FIRST, LAST = 2.0, 4.0
 """Scale at the start, and the residual beyond which a match is rejected, in medians of the residuals. With normal noise
@@ -93,6 +94,7 @@ def solve_graduated(
         raise ProblemError("the problem has no observations, of which wrong ones might be rejected")
     if not max_residual >= 0:
         raise ValueError(f"max_residual must not be negative, is {max_residual}")
+    problem = as_measured(problem)
     callback, waiting = shown(callback, verbose)
     solves = Consecutive(policy, callback, watch, waiting)
     away = facing_away(problem)

@@ -32,6 +32,7 @@ from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import check_problem, placed
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.solve import Solution, solution_of, solve
+from jaxba.solver.start import as_measured
 from jaxba.structure.cells import NO_CELL, Sizes, cell_for, choose_cells
 
 BANK = 32  # problems of a bank for each lane; on a CPU it has one lane, and half a second of work
@@ -168,6 +169,9 @@ class _Many:
             if isinstance(problem, Exception):
                 raise problem
             check_problem(problem)
+            if self._options.max_iterations:
+                problem = as_measured(problem)
+            job = _Job(problem, job.result)
             sizes = _sizes(problem)
         except Exception as error:
             job.result.set_result(error)

@@ -31,6 +31,7 @@ from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.progress import SILENT, Waiting, shown
+from jaxba.solver.start import as_measured
 from jaxba.solver.stepwise import Stepwise, iterations_before
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
@@ -183,6 +184,10 @@ def solve(
     A scene far from the origin relative to its size, as georeferenced scenes are, is shifted to the origin, solved and
     shifted back (`preprocess.FAR`).
 
+    Where other residuals than those of pixels fit badly, the scene is first moved, turned and scaled as a whole to what
+    they say, as far as constants, rigs and measured positions leave it free (solver/start.py); the initial cost is that
+    there.
+
     An image with more than half of its views behind it is left out with a ProblemWarning (`Solution.set_aside`), unless
     half of the images are like that.
 
@@ -215,6 +220,8 @@ def solve(
     callback, waiting = shown(callback, verbose)
     hooks: dict[str, Any] = {"callback": callback, "waiting": waiting}
     check_problem(problem)
+    if checked_options(options).max_iterations:
+        problem = as_measured(problem)
     part = observed_part(problem)
     whole = functools.partial(part.whole, problem)
     watched = watch and (lambda record, now: watch(record, lambda: whole(now())))
