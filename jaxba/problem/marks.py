@@ -43,6 +43,13 @@ def of_marks(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
     return np.asarray(problem.point_index) >= problem.num_points - count
 
 
+def whitening_of(problem: BundleProblem) -> Float[np.ndarray, "observations 2 2"]:
+    """`BundleProblem.whitening`, also where that is the identity."""
+    if problem.whitening is None:
+        return np.tile(np.eye(2), (problem.num_observations, 1, 1))
+    return np.asarray(problem.whitening)
+
+
 class Found(NamedTuple):
     """How a problem has surveyed points."""
 
@@ -96,8 +103,7 @@ def with_marks(
     changes: dict[str, Any] = {"points": joined(points, starts), "observations": joined(problem.observations, pixels)}
     changes |= {"camera_index": joined(camera, image), "point_index": joined(point, mark + len(points))}
     if problem.whitening is not None or sigma != 1.0:
-        eye = np.tile(np.eye(2), (len(point), 1, 1)) if problem.whitening is None else problem.whitening
-        changes["whitening"] = joined(eye, np.tile(np.eye(2) / sigma, (len(pixels), 1, 1)))
+        changes["whitening"] = joined(whitening_of(problem), np.tile(np.eye(2) / sigma, (len(pixels), 1, 1)))
     if (labels := problem.labels) is not None:
         ids = labels.points.max(initial=0) + 1 + np.arange(count)
         changes["labels"] = replace(labels, points=joined(labels.points, ids), marks=names)

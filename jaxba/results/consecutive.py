@@ -71,6 +71,7 @@ def joined(before: Solution, last: Solution) -> Solution:
     return replace(
         last,
         initial_cost=before.initial_cost,
+        start=before.start,
         iterations=before.iterations + last.iterations,
         accepted=before.accepted + last.accepted,
         history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),

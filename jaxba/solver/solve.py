@@ -19,6 +19,7 @@ from jaxba.model.registration import costs_by_kind
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.frames import num_unknowns
 from jaxba.problem.hold import hold
+from jaxba.problem.losses import Loss
 from jaxba.problem.part import observed_part
 from jaxba.problem.residuals import PIXELS
 from jaxba.runtime import process
@@ -90,6 +91,12 @@ class Solution(ArrayRecord):
     lenses_free: bool = True
     """Whether `SolveOptions.intrinsics` were."""
 
+    loss: Loss = field(default=Loss())
+    """Robust loss of the pixels."""
+
+    start: BundleProblem | None = None
+    """Where the solve began, for `notes`; None without residuals besides pixels."""
+
     rejected: Bool[np.ndarray, " observations"] | None = None
     """Wrong matches that `solve_graduated` found, which count in no cost; None of other solves."""
 
@@ -98,9 +105,14 @@ class Solution(ArrayRecord):
         """What was measured and does not fit: a line for each kind of residuals, besides pixels without a stated
         accuracy, that fails a test of its standard deviations (solver/fit.py), with the names of its largest rows.
         Computed when it is first asked for."""
-        from jaxba.solver.notes import notes_of
+        from jaxba.solver.notes import Solved, notes_of
 
-        return notes_of(self.problem, self._counted) if self.iterations else ()
+        if not self.iterations:
+            return ()
+        intrinsics = "free" if self.lenses_free else "fixed"
+        options = SolveOptions(loss=self.loss, intrinsics=intrinsics)
+        again = functools.partial(_continued, options)
+        return notes_of(Solved(self.start or self.problem, self.problem, self._counted, self.loss, intrinsics, again))
 
     @property
     def num_residuals(self) -> int:
@@ -228,7 +240,8 @@ def solve(
     if checkpoint:
         hooks["checkpoint"] = Checkpoint(checkpoint, part.problem, policy, checked_options(options))
     found = solve_without(None, part.problem, policy, options, watch=watched, **hooks)
-    return replace(found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside])
+    start = problem if problem.residuals else None
+    return replace(found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside], start=start)
 
 
 def solve_without(
@@ -290,6 +303,18 @@ def solve_without(
         return replace(found, compile_s=compile_s, quick_iterations=driver.quick_iterations)
 
 
+AGAIN = "ceres"
+"""Policy of further solves: a rule, which compiles in half of the time."""
+
+
+def _continued(options: SolveOptions, problem: BundleProblem, iterations: int) -> BundleProblem:
+    """A problem after some more iterations, from Python, so that all limits use the same programs."""
+    options = replace(options, max_iterations=iterations)
+    go_on = lambda record: False
+    away = np.zeros(0, int)  # views of images that face away are left out already
+    return solve_without(away, problem, AGAIN, options, callback=go_on, watch=None).problem
+
+
 def solution_of(
     setup: Setup, state: LMState, initial_cost: float, steps: StepInfo, end: Termination, total_s: float
 ) -> Solution:
@@ -314,6 +339,8 @@ def solution_of(
         capacity=setup.capacity,
         set_aside=setup.away,
         lenses_free=setup.options.intrinsics == "free",
+        loss=setup.options.loss,
+        start=setup.problem if setup.problem.residuals else None,
     )
 
 
