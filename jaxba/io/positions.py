@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.accuracies import without_accuracy
+from jaxba.io.accuracies import Accuracies, covariances_of, without_accuracy
 from jaxba.io.files import StrPath, display_name, reason
 from jaxba.io.image_files import files_of_images
 from jaxba.io.json_records import Record, read_json
@@ -21,8 +21,9 @@ from jaxba.io.position_tables import WGS84, Positions, read_table
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
 
-GPS, ABOVE_SEA = 0x8825, 5
-"""Block of the EXIF data of a photo with its position, and the field that is 1 below sea level."""
+GPS, ABOVE_SEA, ACCURACY = 0x8825, 5, 31
+"""Block of the EXIF data of a photo with its position, and its fields: 1 below sea level, and GPSHPositioningError, the
+horizontal accuracy in metres. Source: CIPA DC-008 (EXIF 2.32), section 4.6.6."""
 
 
 def read_file(path: StrPath, crs_is_geographic: bool | None = None) -> Positions:
@@ -110,20 +111,25 @@ def _matrix(record: Record) -> Float[np.ndarray, "3 4"]:
 def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:
     """Reads the GPS position of each photo of a folder that has one, by the names of images, which photos may have in
     another case or with another ending. Raises ProblemError: none has; one line."""
-    found, places = [], []
+    found, places, accuracies = [], [], []
     names = list(names)
     for name, file in zip(names, files_of_images(folder, names), strict=True):
         place = None if file is None else _place_of(file)
         if place is not None:
             found.append(name)
-            places.append(place)
+            places.append(place[:3])
+            accuracies.append(str(place[3]))
     if not found:
         raise ProblemError(f"{display_name(folder)}: no photo of the model there has a GPS position")
-    return Positions(found, np.array(places), None, WGS84, degrees=True)
+    column = Accuracies("sxy", "GPSHPositioningError", np.nan, accuracies)
+    known = [column] if set(accuracies) != {"nan"} else []
+    covariances, notes = covariances_of(known, (), found, np.ones(len(found), bool), display_name(folder))
+    return Positions(found, np.array(places), covariances, WGS84, notes=notes, degrees=True)
 
 
 def _place_of(photo: Path) -> list[float] | None:
-    """Longitude, latitude and height of a photo; None: it is not there, is no photo, or has no place."""
+    """Longitude, latitude, height and horizontal accuracy (NaN: not known) of a photo; None: it is not there, is no
+    photo, or has no place."""
     from PIL import Image
 
     try:
@@ -131,9 +137,10 @@ def _place_of(photo: Path) -> list[float] | None:
             gps = image.getexif().get_ifd(GPS)
         below = gps.get(ABOVE_SEA, 0) in (1, b"\x01")
         place = [_degrees(gps[4], gps[3]), _degrees(gps[2], gps[1]), float(gps[6]) * (-1.0 if below else 1.0)]
+        accuracy = float(gps.get(ACCURACY, np.nan))
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, SyntaxError):
         return None
-    return place if np.isfinite(place).all() else None
+    return [*place, accuracy] if np.isfinite(place).all() else None
 
 
 def _degrees(parts: Any, side: str) -> float:

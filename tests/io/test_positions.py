@@ -276,9 +276,18 @@ def test_photos_have_the_position_of_their_camera(tmp_path):
         exif = image.getexif()
         exif[0x8825] = gps
         image.save(tmp_path / name, exif=exif)
-    names, places, _, crs, *_ = read_photos(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
+    names, places, covariances, crs, *_ = read_photos(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
     assert (names, crs) == (["a.jpg", "b.jpg"], "EPSG:4326")
     np.testing.assert_allclose(places, [[-8.51, -47.3, 500], [8.51, 47.3, -2.5]], atol=1e-9)
+    assert covariances is None
+    image = Image.new("RGB", (4, 3))
+    exif = image.getexif()
+    exif[0x8825] = {1: "N", 2: (47.0, 18.0, 0.0), 3: "E", 4: (8.0, 30.0, 36.0), 6: 500.0, 31: 4.5}
+    image.save(tmp_path / "d.jpg", exif=exif)
+    found = read_photos(tmp_path, ["a.jpg", "d.jpg"])
+    assert found.covariances is not None
+    np.testing.assert_allclose(np.diagonal(found.covariances, axis1=1, axis2=2), [[4.5**2, 4.5**2, 81]] * 2)
+    assert ["no accuracy of heights" in found.notes[0], found.notes[1][-5:]] == [True, "a.jpg"]
     with pytest.raises(ProblemError, match="no photo of the model there has a GPS position"):
         read_photos(tmp_path, ["c.jpg"])
 
