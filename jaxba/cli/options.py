@@ -106,5 +106,26 @@ def _error(drawn: str) -> str:
     text = _COLORS.sub("", drawn)
     parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
     message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text
+    message = _in_plain_words(message)
     near = re.findall(r"^. {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
     return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
+
+
+_KINDS = {"int": "a whole number", "float": "a number"}
+"""What a message calls the types of values."""
+
+
+def _in_plain_words(message: str) -> str:
+    """A message of tyro about one value, without its and Python's words; others as they are."""
+    parsed = re.match(r"Error parsing (\S+): ", message)
+    failed = r"invalid literal for (int)\(\) with base 10|could not convert string to (float)"
+    value = re.search(rf"(?:{failed}): (.*)$", message)
+    if parsed and value:
+        kind = _KINDS[value[1] or value[2]]
+        return f"{parsed[1]} must be {kind}, not {value[3]}"
+    choice = re.match(r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\)\.$", message)
+    if choice:
+        known = sorted({*re.findall(r"'([^']*)'", choice[3])} - {"None"})  # tyro has them in any order
+        return f"{choice[2]} must be one of {', '.join(known)}, not {choice[1]}"
+    missing = re.match(r"Missing value for argument '(.*)'\. Expected 1 values\.$", message)
+    return f"{missing[1]} needs a value" if missing else message

@@ -20,6 +20,7 @@ from jaxba.damping.learned import LearnedPolicy, always
 from jaxba.damping.policy import DampingPolicy, check_policy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
+from jaxba.problem.checks import shown
 from jaxba.typing import InputError
 
 LEARNED, BOLD = "learned", "bold"  # the shipped network, for lambda alone, and the guard of agents without a network
@@ -57,6 +58,8 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`: `learned`; the path of a policy file; `FILE.py:CLASS`, for which the file is run; a key
     of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; or `constant:LAMBDA`. Raises InputError: no such
     policy, a lambda that is not a positive number, or a path that is not of a policy file."""
+    if not isinstance(name, str):
+        raise InputError(f"the name of a policy must be a text, not {shown(name)}")
     if re.fullmatch(OWN, name):
         return _own(*name.rsplit(":", 1))
     if is_learned(name):

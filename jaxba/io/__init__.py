@@ -12,7 +12,7 @@ from jaxba.io.colmap import check_model, is_colmap, read_colmap, write_colmap
 from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.nerfstudio import write_transforms
 from jaxba.io.ply import write_ply
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning, check_is_problem
 
 
 def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
@@ -37,6 +37,7 @@ def write_problem(problem: BundleProblem, path: StrPath) -> None:
     """Writes a problem: a folder, or a name that ends in a separator, is a COLMAP model that is like no other, `.out` a
     Bundler model, `.ply` a point cloud for viewers, `.json` cameras for nerfstudio, every other name that is not
     another format's a BAL file. Files may be compressed. Raises ProblemError: as `check_output` and the writers do."""
+    check_is_problem(problem)
     check_output(path)
     (write_colmap if is_folder(path) else formats.writer(path))(problem, path)
 

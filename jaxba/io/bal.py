@@ -16,7 +16,7 @@ from jaxba.io.encoding import text_pieces
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
 from jaxba.io.text import Text
-from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError, check_is_problem
 from jaxba.typing import LARGEST_COUNT
 
 _BLOCK_ROWS = 1 << 18  # observations, or numbers, that are written at once
@@ -60,6 +60,7 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
 
 def bal_only(problem: BundleProblem, path: StrPath) -> BundleProblem:
     """What a file of BAL's cameras holds of a problem, checked. Raises ProblemError."""
+    check_is_problem(problem)
     check_bal_lenses(problem, path)
     arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
     return BundleProblem.create(*arrays)

@@ -179,6 +179,9 @@ def _system(crs: str) -> Any:
         from pyproj.exceptions import CRSError
     except ModuleNotFoundError:
         raise ValueError("coordinate systems need pyproj: pip install jaxba[survey]") from None
+    if not isinstance(crs, str | int):
+        raise ValueError(f"a coordinate system is a text such as EPSG:32633, not {shown(crs)}")
+    crs = str(crs)  # a number is EPSG's
     shortened = _NAMED.match(crs)  # WKT without its parameters
     for text in (crs, *([shortened[1]] if shortened else [])):
         try:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.problem.checks import indices, inverse_roots, real_numbers
+from jaxba.problem.checks import indices, inverse_roots, real_numbers, shown
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
@@ -32,6 +32,12 @@ class ProblemError(InputError):
 
 class NothingObserved(ProblemError):
     """No observation is left that could be solved. The message is one line for the user."""
+
+
+def check_is_problem(problem: Any) -> None:
+    """Raises ValueError: it is something else; one line."""
+    if not isinstance(problem, BundleProblem):
+        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {shown(problem)}")
 
 
 class ProblemWarning(UserWarning):

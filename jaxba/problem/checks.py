@@ -39,7 +39,23 @@ def real_numbers(name: str, values: Any) -> np.ndarray:
             return np.ascontiguousarray(array, np.float64).reshape(array.shape)
     except (TypeError, ValueError, OverflowError):  # objects
         pass
-    raise ValueError(f"{name} must be real numbers, not {array.dtype}")
+    raise ValueError(f"{name} must be real numbers, not {shown(values)}")
+
+
+def real_number(name: str, value: Any) -> float:
+    """A number, perhaps infinite. Raises ValueError: something else; one line."""
+    number = real_numbers(name, value)
+    if number.shape or value is None:
+        raise ValueError(f"{name} must be one number, not {shown(value)}")
+    return float(number)
+
+
+def random_numbers(seed: Any) -> np.random.Generator:
+    """The generator of a seed, or a generator itself. Raises ValueError: the seed is neither; one line."""
+    try:
+        return np.random.default_rng(seed)
+    except (TypeError, ValueError):
+        raise ValueError(f"seed must be a whole number that is not negative, not {shown(seed)}") from None
 
 
 def indices(name: str, values: Any, bound: int, count: int) -> Int[np.ndarray, " n"]:

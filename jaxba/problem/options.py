@@ -8,6 +8,7 @@ import operator
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
+from jaxba.problem.checks import shown
 from jaxba.problem.losses import Loss
 from jaxba.typing import LARGEST_COUNT
 
@@ -193,8 +194,8 @@ class StepOptions:
 
 def check_known(name: str, value: Any, kind: Any) -> None:
     """Raises a ValueError unless a value is one of a `Literal`."""
-    if value not in get_args(kind):
-        raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {value!r}")
+    if not isinstance(value, str) or value not in get_args(kind):
+        raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {shown(value)}")
 
 
 def check_count(name: str, value: Any, least: int) -> None:
@@ -202,7 +203,7 @@ def check_count(name: str, value: Any, least: int) -> None:
     try:
         count = operator.index(value)
     except TypeError:
-        raise ValueError(f"{name} must be a whole number, is {value!r}") from None
+        raise ValueError(f"{name} must be a whole number, is {shown(value)}") from None
     if count < least:
         raise ValueError(f"{name} must be at least {least}, is {value}")
     if count > LARGEST_COUNT:

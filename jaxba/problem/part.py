@@ -11,6 +11,7 @@ from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import BundleProblem, NothingObserved
 from jaxba.problem.hold import Which, every_lens, hold, mask_of
+from jaxba.problem.options import check_count
 from jaxba.problem.preprocess import observed
 
 FEW = 0.5
@@ -39,7 +40,8 @@ def part(
         ignored: points that do not count.
         min_track: fewest observations of a point, in all of the problem, with which it counts.
 
-    Raises ValueError: no such image or point. Raises NothingObserved, a ProblemError: nothing is left."""
+    Raises ValueError: no such image or point, or no count. Raises NothingObserved, a ProblemError: nothing is left."""
+    check_count("min_track", min_track, 0)
     camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     mine = mask_of(problem, images, problem.num_cameras, "image")
     whole, dropped = (mask_of(problem, which, problem.num_points, "point") for which in (points, ignored))

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.checks import random_numbers, real_number
 from jaxba.problem.geometry import camera_centers, rotation_matrices, translations
 from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity, transformed
@@ -81,9 +82,9 @@ def perturb(
         translation_sigma: scene units, on each component.
         point_sigma: scene units, on each coordinate."""
     for name, sigma in (("rotation", rotation_sigma), ("translation", translation_sigma), ("point", point_sigma)):
-        if not (np.isfinite(sigma) and sigma >= 0):
+        if not 0 <= real_number(f"{name}_sigma", sigma) < np.inf:
             raise ProblemError(f"{name}_sigma must not be negative, got {sigma}")
-    rng = np.random.default_rng(seed)
+    rng = random_numbers(seed)
     points = np.asarray(problem.points, dtype=np.float64)
     points = points + point_sigma * rng.standard_normal(points.shape)
     cameras = np.array(problem.cameras, dtype=np.float64)

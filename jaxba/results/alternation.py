@@ -52,6 +52,7 @@ def solve_and_retriangulate(
             is too small (`Retriangulation.pays`).
         watch: as for `solve`; iterations and seconds are counted over all solves.
         verbose: as for `solve`."""
+    check_problem(problem)
     options = checked_options(options)
     check_problem(problem)
     problem = as_measured(problem)

@@ -35,7 +35,7 @@ from jaxba.lm.records import LMState
 from jaxba.lm.step import state_of
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, check_is_problem
 from jaxba.problem.facing import facing_away
 from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, fixed_freedoms, free_directions
 from jaxba.problem.intrinsics import POSE_SIZE
@@ -89,7 +89,8 @@ class SolveInputs(NamedTuple):
 
 
 def inputs_of(problem: BundleProblem) -> SolveInputs:
-    """The numbers of a problem that `differentiable_solve` takes."""
+    """The numbers of a problem that `differentiable_solve` takes. Raises ValueError: it is none."""
+    check_is_problem(problem)
     data = tuple(rows.data for rows in problem.residuals.rows)
     return SolveInputs(problem.observations, problem.cameras, problem.points, data, problem.whitening)
 

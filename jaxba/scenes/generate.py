@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.checks import random_numbers
 from jaxba.problem.geometry import angle_axis, camera_centers, depths, project, rotation_matrices, translations
 from jaxba.scenes.config import SceneConfig, check
 from jaxba.scenes.tracks import track_lengths
@@ -30,7 +31,7 @@ def random_scene_with_truth(
     where the geometry allows it. `seed` is a seed or a generator; the same seed gives the same numbers. Returns (start,
     truth). Raises ProblemError: the options contradict each other, or the cameras overlap too little for them."""
     check(config)
-    rng = np.random.default_rng(seed)
+    rng = random_numbers(seed)
     path, truth = _path_and_truth(config, rng)
     truth = _measure(config, truth, rng)
     return _perturbed(config, path, truth, rng), truth

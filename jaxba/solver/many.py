@@ -22,6 +22,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState
 from jaxba.lm.termination import Termination
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.checks import shown
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Level, ParallelCompilation, program
 from jaxba.runtime.numerics import numerics
@@ -78,6 +79,8 @@ def solve_many(
         Exception: what reading `problems` raises, after the results of those that were read."""
     if jax.distributed.is_initialized():
         raise ValueError("solve_many is for one process: start others without connecting them, and divide the problems")
+    if not isinstance(problems, Iterable):
+        raise ValueError(f"problems must be several, in a list or a stream, not {shown(problems)}")
     options = checked_options(options)
     if isinstance(policy, str):
         policy, options = resolve_policy(policy, options)

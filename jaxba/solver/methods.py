@@ -14,6 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
 from jaxba.lm.method import PLAIN, StepMethod
+from jaxba.problem.checks import shown
 from jaxba.typing import InputError
 
 DEFAULT_METHOD = PLAIN.name
@@ -58,6 +59,8 @@ METHODS: Mapping[str, StepMethod] = _Methods()
 def make_method(name: str) -> StepMethod:
     """The method called `name`, a key of `METHODS`; methods with clusters of cameras accept their largest size, as in
     `stba:16`. Raises InputError: no such method, or an invalid size."""
+    if not isinstance(name, str):
+        raise InputError(f"the name of a method must be a text, not {shown(name)}")
     if name == DEFAULT_METHOD:
         return PLAIN
     base, colon, size = name.partition(":")

@@ -9,6 +9,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import trained_step
 from jaxba.lm.method import StepMethod, check_plain
 from jaxba.lm.termination import Tolerances
+from jaxba.problem.checks import real_number, shown
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
     ConjugateGradients,
@@ -106,20 +107,20 @@ class SolveOptions:
         for name, kind in _GROUPS.items():
             value = getattr(self, name)
             if not isinstance(value, kind) and not (value is None and name in ("refinement", "coordinates")):
-                raise ValueError(f"{name} must be made with jaxba.{kind.__name__}, is {value!r}")
+                raise ValueError(f"{name} must be made with jaxba.{kind.__name__}, is {shown(value)}")
         if isinstance(self.method, str):
             make_method(self.method)
         elif not isinstance(self.method, StepMethod):
-            raise ValueError(f"method must be an entry of jaxba.METHODS or its name, is {self.method!r}")
+            raise ValueError(f"method must be an entry of jaxba.METHODS or its name, is {shown(self.method)}")
         for name, known in _CHOICES.items():
             check_known(name, getattr(self, name), known)
         check_count("max_iterations", self.max_iterations, 0)
-        if self.within:
+        if real_number("within", self.within):
             object.__setattr__(self, "tolerances", self.tolerances._replace(within=self.within))
         if self.devices is not None:
             check_count("devices", self.devices, 1)
         for name, value in self.tolerances._asdict().items():
-            if not value >= 0:
+            if not real_number(name, value) >= 0:
                 raise ValueError(f"{name} must not be negative, is {value}")
 
     def step_options(self, policy: DampingPolicy) -> StepOptions:
@@ -153,5 +154,5 @@ def checked_options(options: SolveOptions | None) -> SolveOptions:
     if options is None:
         return SolveOptions()
     if not isinstance(options, SolveOptions):
-        raise ValueError(f"options must be made with jaxba.SolveOptions, are {options!r}")
+        raise ValueError(f"options must be made with jaxba.SolveOptions, are {shown(options)}")
     return options

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.lm.records import LMState
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, check_is_problem
 from jaxba.problem.constants import Constants
 from jaxba.problem.facing import without_views_of
 from jaxba.problem.frames import in_frames, out_of_frames
@@ -90,8 +90,7 @@ def check_problem(problem: BundleProblem) -> None:
     """First of all in every public function of a problem that computes with JAX. Raises ValueError: it is no problem.
     Raises TypeError: JAX traces it. Raises ProblemError: it has neither observations nor other residuals. Raises
     RuntimeError: the process was forked from one in which JAX had started."""
-    if not isinstance(problem, BundleProblem):
-        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
+    check_is_problem(problem)
     if not problem.num_observations and not problem.residuals:
         raise ProblemError("the problem has no observations")
     refuse_traces(vars(problem))

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.options import check_count
 from jaxba.runtime import process
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
@@ -27,7 +28,8 @@ def solve_recipes(
     """Solves a problem with a policy, and with the next ones of `RECIPES`, `count` in all, on as many cores. Returns
     all solutions; `min(found, key=lambda one: one.final_cost)` is the best. Each compiles a program of its own. Raises
     as `solve`; ValueError: there are not so many recipes."""
-    if not 1 <= count <= len(RECIPES):
+    check_count("count", count, 1)
+    if count > len(RECIPES):
         raise ValueError(f"there are 1 to {len(RECIPES)} recipes, not {count}")
     with ThreadPoolExecutor(process.threads()) as pool:
         return list(pool.map(lambda one: solve(problem, one, options), (policy, *RECIPES[1:count])))

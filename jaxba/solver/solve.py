@@ -229,6 +229,9 @@ def solve(
             another solve.
         RuntimeError: this process was forked from one in which JAX had started.
         TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`."""
+    for name, function in (("callback", callback), ("watch", watch)):
+        if function and not callable(function):
+            raise ValueError(f"{name} must be a function")
     callback, waiting = shown(callback, verbose)
     hooks: dict[str, Any] = {"callback": callback, "waiting": waiting}
     check_problem(problem)
