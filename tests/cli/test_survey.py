@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import sqlite3
 import warnings
 from pathlib import Path
@@ -16,7 +17,7 @@ from support import constrained
 
 import jaxba
 from jaxba import ProblemError, ProblemWarning
-from jaxba.cli.common import UsageError
+from jaxba.cli.common import MISFIT, UsageError
 from jaxba.cli.solve import run
 from jaxba.model.registration import costs_by_kind
 from jaxba.problem import geometry
@@ -269,6 +270,29 @@ def test_the_written_model_stays_in_metres(scene, tmp_path, capsys):
     assert "c.yaml: position_priors: the scene is in metres east, north and up of" in capsys.readouterr().out
     centers = geometry.camera_centers(jaxba.read_colmap(tmp_path / "out").cameras)
     np.testing.assert_allclose(distances(centers), distances(10 * geometry.camera_centers(problem.cameras)), atol=0.1)
+
+
+def test_a_position_that_does_not_fit_is_named_and_strict_ends_with_a_status(scene, tmp_path, capsys):
+    """The solution is written, and the log has the note."""
+    folder, problem, places = scene
+    wrong = np.array(places)
+    wrong[2, 2] += 10.0  # metres up, 200 standard deviations
+    write_log(tmp_path / "log.csv", problem, wrong)
+    log = (tmp_path / "log.csv").read_text().splitlines()
+    (tmp_path / "log.csv").write_text("\n".join([*log[:-1], ""]))  # strict refuses the image that is not there
+    (tmp_path / "c.yaml").write_text("position_priors: {file: log.csv}\n")
+    files = {"--constraints": "c.yaml", "--output": "out", "--log": "log.json"}
+    options = [word for option, name in files.items() for word in (option, str(tmp_path / name))]
+    assert run([str(folder), *options, "--strict", "--policy", "ceres"]) == MISFIT
+    shown = capsys.readouterr()
+    (note,) = [
+        line for line in shown.out.splitlines() if line.startswith("note: position_prior: does not fit the rest")
+    ]
+    assert problem.labels.names[2] in note
+    assert not [name for name in problem.labels.names if name in note and name != problem.labels.names[2]]
+    assert shown.err.endswith("error: --strict: what was measured does not fit, see the notes above\n")
+    assert len(jaxba.read_colmap(tmp_path / "out").cameras) == 6
+    assert json.loads((tmp_path / "log.json").read_text())["notes"] == [note.removeprefix("note: ")]
 
 
 @pytest.mark.parametrize(
