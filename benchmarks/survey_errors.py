@@ -4,8 +4,8 @@
 
 Each survey is written as files (`benchmarks/survey_scenes.py`), read by `jaxba.survey` and solved by `jaxba.solve`;
 every tenth goes through `jaxba-solve`. An error is found if there is an error, a note or one of `Solution.notes`, and
-named if that has the name of the row which is wrong, or of a whole table its key, or what its columns are. An error
-that does no harm (cameras are where they are without it) counts as both: a table of feet may be read as such."""
+named if that has the name of the row which is wrong, or of a whole table its key, or what its columns are. A table of
+other units or with its columns swapped may be read as meant, too, so that cameras are where they are without it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -52,14 +52,11 @@ class Outcome:
     away: float  # RMS distance of camera centres from the truth, metres; NaN where it was refused or not georeferenced
     limit: float  # what it may be without an error
 
-    @property
-    def said(self) -> bool:
-        return bool(self.notes)
+    mended: bool = False  # whether the survey was read as meant
 
     @property
-    def right(self) -> bool:
-        """Whether the error did no harm."""
-        return self.away < self.limit
+    def said(self) -> bool:
+        return bool(self.notes) or self.mended
 
     def names(self, words: Words) -> bool:
         return any(re.search(word, note, re.IGNORECASE) for word in words for note in self.notes)
@@ -179,6 +176,9 @@ KINDS: dict[str, tuple[Callable[[Survey, Rng], Words], Words]] = {
 """Gross errors: what makes one and says how it is named, and the shapes and contents of surveys that have them."""
 
 
+READ = ("degrees", "units")  # kinds of errors that a reader may mend
+
+
 def _converted(survey: Survey, source: str, target: str) -> np.ndarray:
     import pyproj
 
@@ -268,7 +268,7 @@ def table(kinds: Sequence[str], results: dict[str, list[tuple[Outcome, bool]]], 
 def _line(found: list[Outcome], named: int) -> str:
     away = [one.away for one in found if np.isfinite(one.away)]
     off = f"{np.median(away):.3g}, {np.max(away):.3g}" if away else "refused"
-    said = sum(one.said or one.right for one in found) if named else sum(one.said for one in found)
+    said = sum(one.said for one in found)
     return f"{len(found):7} {said:5} {named:6}  {off}"
 
 
@@ -289,7 +289,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     clean = []
     for number, (kind, survey, words) in enumerate(surveys_of(kinds, args.surveys, args.seed)):
         outcome = looked_at(survey, bool(args.command) and number % args.command == args.command - 1)
-        named = outcome.names(words) or outcome.right
+        outcome = replace(outcome, mended=kind in READ and outcome.away < outcome.limit)
+        named = outcome.names(words) or outcome.mended
         results[kind].append((outcome, named))
         if args.verbose or not named:
             _print(f"{kind} {'named' if named else 'NOT NAMED'} in {survey.heading}", outcome)
