@@ -16,7 +16,7 @@ from jaxba.io.notes import report
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.marks import Marks
-from jaxba.problem.misfit import BENDS, MISFIT, extent_of, wrong_places, wrong_text
+from jaxba.problem.misfit import MISFIT, extent_of, wrong_places, wrong_text
 from jaxba.results.retriangulate import retriangulate
 
 EDGE = 0.01  # share of an image by which marks may lie outside: its border may be cut by an undistortion
@@ -29,6 +29,10 @@ BETTER, LEAST_LEFT = 0.1, 4
 than the marks have."""
 
 ENOUGH = 100_000  # observations of which a median is taken
+
+DEEPER = 0.1
+"""Share of the extent of cameras and points by which these may be too far from the cameras, whose positions alone are
+measured: images that all look down hardly tell a focal length from a height."""
 
 MANY = 0.1  # share of the pixels which lie outside that typing errors do not explain
 
@@ -190,7 +194,7 @@ def places_texts(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "m
         One line, or none if they do not differ, or noise or a bent scene explains it."""
     away = met - marks.places
     around = np.concatenate([np.asarray(problem.points), geometry.camera_centers(problem.cameras)])
-    bound = max(BENDS * extent_of(around), MISFIT * _deviation_of_positions(problem))
+    bound = max(DEEPER * extent_of(around), MISFIT * _deviation_of_positions(problem))
     distance = np.linalg.norm(away, axis=1)
     shift = np.median(away, axis=0)
     moved = float(np.linalg.norm(shift))

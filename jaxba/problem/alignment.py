@@ -102,20 +102,18 @@ def misfit_texts(
 def check_axes(
     places: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
 ) -> bool:
-    """Whether measured positions fit places of a scene, and as well if an axis is mirrored, as those in a plane do.
+    """Whether measured positions fit places of a scene as well if an axis is mirrored, as those in a plane do.
 
     Raises ProblemError: they fit well with other axes or units only."""
     best, _ = _robust_fit(places, positions, covariances)
-    away, sigmas = off_by(best.points(places) - positions, covariances)
-    misfit = float(sigmas.max())
+    misfit = float(np.max(_distances(best, places, positions, covariances)))
     if misfit > DOUBTFUL * NEARLY_ALL:
         _refuse_other_axes(places, positions)
-    if away.max() > BENDS * extent_of(positions):
-        return False
     mirrored = positions * [-1, 1, 1]
-    turned = covariances * _MIRRORED
-    other, _ = _robust_fit(places, mirrored, turned)
-    return float(np.max(_distances(other, places, mirrored, turned))) < DOUBTFUL * max(misfit, NEARLY_ALL)
+    other, _ = _robust_fit(places, mirrored, covariances * _MIRRORED)
+    away, sigmas = off_by(other.points(places) - mirrored, covariances * _MIRRORED)
+    fits = not ((away > BENDS * extent_of(positions)) & (sigmas > MISFIT)).any()
+    return fits and float(sigmas.max()) < DOUBTFUL * max(misfit, NEARLY_ALL)
 
 
 def alignment(
