@@ -157,9 +157,11 @@ def _check_values(labels: Labels | None, rows: Rows) -> None:
 def _row_name(labels: Labels | None, rows: Rows, row: int) -> str:
     """A row by the names of its images and points; by its position if it has none."""
     parts: dict[str, Part] = {POSE: "image", POINT: "point"}
-    pairs = zip(rows.residual.unknowns, rows.index, strict=True)
-    kinds = [(parts.get(name.removesuffix(SECOND)), index[row]) for name, index in pairs]
-    names = [part_name(labels, kind, at) for kind, at in kinds if kind]
+    names = []
+    for unknown, index in zip(rows.residual.unknowns, rows.index, strict=True):
+        kind = parts.get(unknown.removesuffix(SECOND))
+        if kind is not None:
+            names.append(part_name(labels, kind, index[row]))
     return ", ".join(names) or f"row {row}"
 
 

@@ -69,7 +69,7 @@ class Labels(ArrayRecord):
         return np.array([known[one] for one in wanted], np.int64)
 
 
-def part_name(labels: Labels | None, kind: Part, at: int | np.integer) -> str:
+def part_name(labels: Labels | None, kind: Part, at: Any) -> str:
     """What a message calls a part of a problem: by its name and id, or by its position where nothing has labels."""
     if labels is None:
         return f"{'camera' if kind == 'image' else kind} {at}"

@@ -24,12 +24,12 @@ Holds = Callable[[Float[np.ndarray, "rows ..."]], Bool[np.ndarray, " rows"]]
 
 def is_positive(values: Float[np.ndarray, "rows ..."]) -> Bool[np.ndarray, " rows"]:
     """Which rows have positive numbers alone."""
-    return (values > 0).reshape(len(values), -1).all(axis=1)
+    return np.all((values > 0).reshape(len(values), -1), axis=1)
 
 
 def is_not_zero(values: Float[np.ndarray, "rows ..."]) -> Bool[np.ndarray, " rows"]:
     """Which rows have a number that is not zero."""
-    return values.reshape(len(values), -1).any(axis=1)
+    return np.any(values.reshape(len(values), -1) != 0, axis=1)
 
 
 def is_unit(values: Float[np.ndarray, "rows n"]) -> Bool[np.ndarray, " rows"]:
