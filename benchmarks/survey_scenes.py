@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxba
@@ -272,7 +272,7 @@ def _fitting(
     visible: Bool[np.ndarray, "candidates images"], seen: Int[np.ndarray, "n views"]
 ) -> Bool[np.ndarray, "n candidates"]:
     """Which candidates all images of each row see."""
-    return visible[:, seen].all(axis=2).T
+    return np.all(visible[:, seen], axis=2).T
 
 
 def _first_of(fitting: Bool[np.ndarray, "n candidates"]) -> Int[np.ndarray, " n"]:
@@ -341,7 +341,7 @@ def _add_marks(survey: Survey, candidates: np.ndarray, rng: np.random.Generator)
     count = CONTROLS + CHECKS
     _, survey.mark_seen = _pattern(survey.shape)
     pixels, visible = _visible(survey.size, survey.lens, survey.turns, survey.centres, candidates)
-    chosen = _spread(candidates, _fitting(visible, survey.mark_seen))
+    chosen = _spread(candidates, list(_fitting(visible, survey.mark_seen)))
     places = candidates[chosen]
     pixels = np.take_along_axis(pixels[chosen], survey.mark_seen[..., None], axis=1)
     survey.mark_pixels = pixels + 0.5 * rng.normal(size=pixels.shape)
@@ -363,7 +363,7 @@ def depth_maps(survey: Survey, size: tuple[int, int], value, rng: np.random.Gene
         point, view = np.nonzero(survey.seen == image)
         pixels = survey.pixels[point, view] * scale
         values = value(depths[point, image]) * (1 + 0.02 * rng.normal(size=len(point)))
-        nearest = cKDTree(pixels).query(cells)[1]
+        nearest = KDTree(pixels).query(cells)[1]
         maps.append(values[nearest].reshape(size[1], size[0]).astype(np.float32))
     return maps
 

@@ -6,7 +6,7 @@ said; `Solution.notes` tests the rest."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -58,7 +58,8 @@ def outside(clicks: Clicks, sigma: float) -> Bool[np.ndarray, " pixels"]:
     """Which pixels lie outside of their image, by more than their noise (`sigma`, pixels) and a border."""
     beyond = EDGE * clicks.sizes + MISFIT * sigma
     out = (clicks.pixels < -beyond) | (clicks.pixels > clicks.sizes + beyond)
-    return out.any(axis=1) & (clicks.sizes > 0).all(axis=1)
+    known = np.all(clicks.sizes > 0, axis=1)
+    return np.any(out, axis=1) & known
 
 
 def outside_text(clicks: Clicks, out: Bool[np.ndarray, " pixels"], names: list[str], images: tuple[str, ...]) -> str:
@@ -173,12 +174,12 @@ def _refuse_other_photos(
     from scipy.optimize import minimize_scalar
 
     between = (SIZES[max(best - 1, 0)], SIZES[min(best + 1, len(SIZES) - 1)])
-    found = minimize_scalar(scaled, bounds=between, method="bounded", options={"xatol": 1e-5 * between[0]})
-    if found.fun < min(bound, MISFIT * noise):
+    nearest: Any = minimize_scalar(scaled, bounds=between, method="bounded", options={"xatol": 1e-5 * between[0]})
+    if nearest.fun < min(bound, MISFIT * noise):
         width, height = clicks.sizes[0].tolist()
         raise ValueError(
-            f"the pixels seem to be those of photos of {found.x:.3g} times the size of the images: about "
-            f"{found.x * width:.0f} x {found.x * height:.0f} instead of {width:g} x {height:g}"
+            f"the pixels seem to be those of photos of {nearest.x:.3g} times the size of the images: about "
+            f"{nearest.x * width:.0f} x {nearest.x * height:.0f} instead of {width:g} x {height:g}"
         )
 
 

@@ -27,7 +27,7 @@ from jaxba.structure.padding import capacity_of
 KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
     *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
-    *("cg_iterations", "termination", "trace"),
+    *("cg_iterations", "termination", "trace", "notes"),
 ]
 TRACE_KEYS = ["iteration", "time_s", "cost", "lambda", "accepted", "cg_iterations", "gain_ratio"]
 

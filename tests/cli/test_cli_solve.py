@@ -39,7 +39,7 @@ from jaxba.solver.record import Record
 RECORD_KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
     *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
-    *("cg_iterations", "termination", "trace"),
+    *("cg_iterations", "termination", "trace", "notes"),
 ]
 
 

@@ -366,7 +366,7 @@ def test_links_and_permissions_of_files_stay(tmp_path):
     assert np.array_equal(read_problem(folder).points, problem.points + 1)
 
 
-@pytest.mark.parametrize("change", [(2, 6, -5.0), (2, 6, np.inf), (3, 4, np.nan), (1, 0, np.nan)])
+@pytest.mark.parametrize("change", [(2, 6, 0.0), (2, 6, np.inf), (3, 4, np.nan), (1, 0, np.nan)])
 def test_what_could_not_be_read_is_not_written(tmp_path, change):
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
     problem = read_problem(folder)
