@@ -24,6 +24,7 @@ def test_the_notebook_learns_weights_that_bring_held_out_points_nearer_to_the_tr
     assert names["after"] < 0.8 * names["before"]
 
 
+@pytest.mark.slow
 def test_a_graph_of_exact_relative_poses_is_solved_and_written(tmp_path):
     random, count = np.random.default_rng(0), 6
     turns, places = Rotation.random(count, rng=0), random.standard_normal((count, 3))

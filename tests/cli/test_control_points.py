@@ -200,6 +200,7 @@ def test_positions_give_the_scene_that_they_give_colmap(block, tmp_path):
     np.testing.assert_allclose(geometry.camera_centers(found.cameras), centers, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_wrong_matches_and_clicks_are_rejected_and_check_points_are_as_far_off_as_without(solved, tmp_path):
     """A fifth of the matches is anywhere, a click of a control point is wrong, and one of the two of a check point."""
     model, rng = jaxba.read_colmap(solved.folder / "model"), np.random.default_rng(1)

@@ -164,6 +164,7 @@ def everything() -> jaxba.BundleProblem:
     return jaxba.with_residual(problem, apart(point=[0, 4], point_2=[9, 5], by=by, sigma=0.1))
 
 
+@pytest.mark.slow
 def test_a_moved_scene_has_the_same_residuals_and_the_same_end():
     problem = everything()
     options = jaxba.SolveOptions(max_iterations=60)

@@ -98,6 +98,7 @@ def test_iterations_are_counted_over_all_solves_and_a_callback_ends_them():
     assert not solution.converged
 
 
+@pytest.mark.slow
 def test_hardly_a_right_match_is_rejected_but_beyond_a_limit_and_an_impossible_limit_is_an_error():
     found = solve_graduated(scene(), options=QUICK).rejected
     assert found is not None

@@ -156,6 +156,7 @@ def test_bad_options_are_refused_before_the_first_result():
     assert list(solve_many([])) == []
 
 
+@pytest.mark.slow
 def test_lanes_that_are_refilled_end_as_one_problem_after_the_other():
     sizes = [Sizes.of(problem) for problem in mixed(7)]
     capacity = choose_cells(sizes, 1.0)[0].capacity

@@ -46,6 +46,7 @@ def test_two_lines_train_a_policy_and_the_same_lines_the_same_one(env):
     assert (run.costs[:, -1] <= run.costs[:, 0]).all()
 
 
+@pytest.mark.slow
 def test_a_reward_of_ones_own_is_the_reward(env):
     state, _ = env.reset(jax.random.key(0))
     _, step = jax.jit(lambda state, action: env.step(state, action))(state, jnp.zeros((4, 1)))
