@@ -89,7 +89,8 @@ def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
     assert truth.norm(made[0] - made[1]) <= 1e-10 * truth.norm(made[1])
 
 
-@pytest.mark.parametrize("damping", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-3])
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [1e-6, 1e-3])
 def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a point together."""
     problem, options = support.tiny(), MANIFOLD
@@ -204,7 +205,9 @@ def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
 # All of them
 
 
-@pytest.mark.parametrize("method", ["lm", "stba", pytest.param("deeplm", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["lm", pytest.param("stba", marks=pytest.mark.slow), pytest.param("deeplm", marks=pytest.mark.slow)]
+)
 def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
     problem = support.tiny()
     small = f"{method}:3" if method == "stba" else method
