@@ -107,6 +107,7 @@ class WholeScene:
             extent=extent,
         )
 
+    @numerics(np.float64)  # spinning threads of BLAS made small eigenvalue problems 200 times slower on a busy machine
     def minimised(
         self, directions: Float[np.ndarray, "7 free"]
     ) -> tuple[Similarity, tuple[Float[np.ndarray, "rows numbers"], ...], float]:
