@@ -5,11 +5,11 @@ the Jacobian J of all residuals, least squares leave
 
     r = Q e,    Q = I - J (J^T J)^-1 J^T <= I,
 
-so that the squares of n numbers of r exceed any bound less often than those of n normals do. Q is the covariance of r,
-its trace the redundancy.
+so that the squares of n numbers of r exceed any bound less often than those of n normals do, or than those of n - m
+normals where m unknowns are in these numbers alone. Q is the covariance of r, its trace the redundancy.
 
-1. All rows of a kind: `sum |r_i|^2` against the upper quantile of chi^2 with as many degrees of freedom as numbers;
-   with Q, `sum |r_i|^2 / a` against that with f of them, `a = tr Q^2 / tr Q` and `f = (tr Q)^2 / tr Q^2` of the kind.
+1. All rows of a kind: `sum |r_i|^2` against the upper quantile of chi^2 with as many degrees of freedom as numbers,
+   less the unknowns that only these have; with Q, `sum |r_i|^2 / a` against that with f of them, `a = tr Q^2 / tr Q` and `f = (tr Q)^2 / tr Q^2` of the kind.
 2. The largest row: `max |r_i|^2` against that with as many as the row has, at the level over the number of rows
    (Bonferroni); with Q, the largest `T_i = r_i^T Q_ii^-1 r_i`, by which the sum of all squares falls without the row.
 
@@ -57,9 +57,10 @@ def too_large(residual: Float[np.ndarray, "rows size"], level: float) -> Bool[np
     return ~(squares <= quantile(residual.shape[1], level / 2 / len(squares)))
 
 
-def fits(residual: Float[np.ndarray, "rows size"], level: float) -> bool:
-    """Whether rows are standard normals as far as both tests say."""
-    together = np.sum(residual**2) <= quantile(residual.size, level / 2)
+def fits(residual: Float[np.ndarray, "rows size"], level: float, unknowns: int = 0) -> bool:
+    """Whether rows are standard normals as far as both tests say, or what least squares leave of them where so many
+    unknowns are in these rows alone."""
+    together = np.sum(residual**2) <= quantile(max(residual.size - unknowns, 1), level / 2)
     return bool(together) and not too_large(residual, level).any()
 
 

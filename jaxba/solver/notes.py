@@ -43,6 +43,7 @@ class Kind(NamedTuple):
     residual: Float[np.ndarray, "rows size"]  # whitened
     row_name: Callable[[int], str]
     off: Callable[[int, np.ndarray], str]  # how far a whitened residual of a row is in its own units; may be empty
+    unknowns: int = 0  # numbers of the blocks that only this kind has
 
 
 class Solved(NamedTuple):
@@ -67,7 +68,7 @@ def notes_of(solved: Solved) -> tuple[str, ...]:
     solved = solved._replace(start=problem.replace(**before), problem=problem)
     clicked = of_marks(solved.problem)
     kinds = _kinds(solved.problem, clicked)
-    worse = [kind for kind in kinds if not fits(kind.residual, LEVEL / len(kinds))]
+    worse = [kind for kind in kinds if not fits(kind.residual, LEVEL / len(kinds), kind.unknowns)]
     if not worse:
         return ()
     try:
@@ -150,12 +151,25 @@ def _kinds(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -
     found = []
     for rows, residual in zip(problem.residuals.rows, residuals_of_rows(problem), strict=True):
         of_rows = functools.partial(_row_name, problem, rows), functools.partial(_off, rows)
-        found.append(Kind(rows.residual.name, residual, *of_rows))
+        found.append(Kind(rows.residual.name, residual, *of_rows, _unknowns_of(problem, rows)))
     if clicked.any():
         marks = problem.subset(clicked)
         of_pixels = functools.partial(_pixel_name, marks), functools.partial(_pixels_off, marks)
         found.append(Kind(MARKS, geometry.residuals(marks), *of_pixels))
     return found
+
+
+def _unknowns_of(problem: BundleProblem, rows: Rows) -> int:
+    """How many numbers are in rows of blocks that no other residual has."""
+    residuals = problem.residuals
+    used: dict[str, list[np.ndarray]] = {}
+    for name, index in zip(rows.residual.unknowns, rows.index, strict=True):
+        used.setdefault(name.removesuffix(SECOND), []).append(np.asarray(index))
+    others = [other.residual.unknowns for other in residuals.rows if other is not rows]
+    shared = {name.removesuffix(SECOND) for names in others for name in names}
+    sizes = dict(zip(residuals.names, residuals.sizes, strict=True))
+    alone = [name for name in used if name in sizes and name not in shared]
+    return sum(sizes[name] * len(np.unique(np.concatenate(used[name]))) for name in alone)
 
 
 def _of_rows(linear: Linear, out: RowsOfKinds, kind: int, kinds: list[Kind]) -> str:

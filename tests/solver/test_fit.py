@@ -37,6 +37,17 @@ def test_residuals_without_their_covariance_fail_less_often():
     assert np.mean([not fits(one, 0.05) for one in drawn]) < 0.05
 
 
+def test_unknowns_of_rows_alone_make_the_test_of_all_rows_sharper_at_the_same_level():
+    """12 unknowns of 60 numbers: half of the level is that of the sum of squares, which rows with standard
+    deviations too small by 1.3 exceed more often than without the number of unknowns."""
+    left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(9)
+    drawn = [(left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(2000)]
+    failed = np.mean([not fits(residual, 0.05, UNKNOWNS) for residual in drawn])
+    assert failed < 0.065  # as above
+    sharper = np.mean([not fits(1.3 * residual, 0.05, UNKNOWNS) for residual in drawn])
+    assert sharper > 1.5 * np.mean([not fits(1.3 * residual, 0.05) for residual in drawn])
+
+
 def test_what_is_left_without_rows_is_what_a_solve_without_them_leaves():
     jacobian, values = design(3), np.random.default_rng(4).normal(size=ROWS * SIZE)
     left = left_of(jacobian, values)
