@@ -9,7 +9,8 @@ so that the squares of n numbers of r exceed any bound less often than those of 
 normals where m unknowns are in these numbers alone. Q is the covariance of r, its trace the redundancy.
 
 1. All rows of a kind: `sum |r_i|^2` against the upper quantile of chi^2 with as many degrees of freedom as numbers,
-   less the unknowns that only these have; with Q, `sum |r_i|^2 / a` against that with f of them, `a = tr Q^2 / tr Q` and `f = (tr Q)^2 / tr Q^2` of the kind.
+   less the unknowns that only these have; with Q, `sum |r_i|^2 / a` against that with f of them, `a = tr Q^2 / tr Q`
+   and `f = (tr Q)^2 / tr Q^2` of the kind.
 2. The largest row: `max |r_i|^2` against that with as many as the row has, at the level over the number of rows
    (Bonferroni); with Q, the largest `T_i = r_i^T Q_ii^-1 r_i`, by which the sum of all squares falls without the row.
 

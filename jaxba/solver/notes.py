@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from jaxba.problem.marks import of_marks, whitening_of
 from jaxba.problem.options import Intrinsics
 from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Rows
 from jaxba.solver.fit import LEAST_REDUNDANCY, LEVEL, Left, explained, fits, instead, is_scale
-from jaxba.solver.redundancy import Noise, TooLargeError, left_of, noise_of
+from jaxba.solver.redundancy import Noise, TooLargeError, left_of, noise_left, noise_of
 from jaxba.solver.robust import LAST, LEAST_SCALE, RowsOfKinds, distances, robust_solution
 
 NAMED = 3  # rows that a note names of more
@@ -62,19 +63,29 @@ def notes_of(solved: Solved) -> tuple[str, ...]:
     """A note for each kind of residuals that does not fit its standard deviations, with the rows to blame.
 
     Pixels count if their deviations are stated, as those of control points are. Whether anything does not fit, the
-    residuals of the solution say; what it is, another solve in which it has no weight."""
+    residuals of the solution say, or those of the pixels that took its error; what it is, another solve in which it has
+    no weight."""
     before = {name: getattr(solved.start, name) for name in ("cameras", "points", "rigs", "residuals")}
     problem = solved.problem.subset(solved.counted)
     solved = solved._replace(start=problem.replace(**before), problem=problem)
     clicked = of_marks(solved.problem)
     kinds = _kinds(solved.problem, clicked)
     worse = [kind for kind in kinds if not fits(kind.residual, LEVEL / len(kinds), kind.unknowns)]
-    if not worse:
-        return ()
     try:
+        if not worse and (not kinds or _fits_with_pixels(solved, clicked)):
+            return ()
         return _explained(solved, clicked, kinds)
     except (TooLargeError, ProblemError, np.linalg.LinAlgError):
         return tuple(_as_found(kind) for kind in worse)
+
+
+def _fits_with_pixels(solved: Solved, clicked: Bool[np.ndarray, " observations"]) -> bool:
+    """Whether all rows fit in a linear model of the solution. Where pixels give way to a wrong row it has hardly a
+    residual, which is large over its own deviation. Their noise is taken to be all that the solution leaves of them."""
+    rows = tuple(replace(kind, loss=Loss()) for kind in solved.problem.residuals.rows)
+    problem = solved.problem.replace(residuals=replace(solved.problem.residuals, rows=rows))
+    left, _ = left_of(problem, clicked, solved.loss, solved.intrinsics, noise_left(problem, clicked))
+    return left.all_fit(LEVEL)
 
 
 def _explained(solved: Solved, clicked: Bool[np.ndarray, " observations"], kinds: list[Kind]) -> tuple[str, ...]:

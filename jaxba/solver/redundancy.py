@@ -127,6 +127,13 @@ def noise_of(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"])
     return Noise(*(max(LEAST_PIXELS, lost * float(np.median(np.abs(one[~clicked])))) for one in found))
 
 
+def noise_left(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -> Noise:
+    """The root mean square of what a solution leaves of the other pixels, per degree of freedom."""
+    spare = max(2 * np.sum(~clicked) - num_unknowns(problem), 1)
+    left = geometry.residuals(problem)[~clicked], (problem.observations - geometry.project(problem))[~clicked]
+    return Noise(*(max(LEAST_PIXELS, float(np.sqrt(np.sum(residual**2) / spare))) for residual in left))
+
+
 def _weights(
     problem: BundleProblem, clicked: Bool[np.ndarray, " observations"], loss: Loss, noise: Noise
 ) -> Float[np.ndarray, " observations"]:

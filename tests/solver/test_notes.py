@@ -98,3 +98,16 @@ def test_a_solve_without_iterations_says_nothing_of_what_fits():
 @pytest.mark.parametrize("count", [1, 6])
 def test_notes_of_problems_without_measurements_are_empty(count):
     assert support.solve(support.tiny(), max_iterations=count).notes == ()
+
+
+@pytest.mark.slow
+def test_a_wrong_bar_that_the_pixels_give_way_to_is_named():
+    """Few images with lenses of their own: a point moves along its rays, and the bar has a tenth of its deviation."""
+    problem = measured(np.zeros((6, 3))).problem
+    length = np.linalg.norm(problem.points[0] - problem.points[1])
+    bar = jaxba.residuals.distance(point=[0], point_2=[1], length=1.2 * length, sigma=SIGMA)
+    solution = jaxba.solve(jaxba.with_residual(problem, bar), "ceres", QUICK)
+    assert np.abs(residuals_of_rows(solution.problem)[1]).max() < 0.5
+    (note,) = solution.notes
+    (error,) = re.search(r"^distance: does not fit the rest: point 0 and point 1 is (-[\d.]+) or", note).groups()
+    assert float(error) == pytest.approx(-0.2 * length, rel=0.1)
