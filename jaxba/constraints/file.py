@@ -10,9 +10,10 @@ from typing import Any, get_args
 
 import numpy as np
 
+from jaxba.constraints.control_points import with_control_points
 from jaxba.constraints.measurements import MEASURED, with_measured
 from jaxba.constraints.report import Report, report
-from jaxba.constraints.surveys import POSITIONS, with_control_points, with_positions
+from jaxba.constraints.surveys import POSITIONS, with_positions
 from jaxba.constraints.values import meant, parse_items, parse_mapping, parse_numbers
 from jaxba.io.files import StrPath
 from jaxba.io.geodesy import Frame, projected

@@ -165,6 +165,11 @@ def parse_word(value: dict[str, Any], key: str) -> str:
     return value[key]
 
 
+def parse_crs(value: dict[str, Any]) -> str:
+    """The coordinate system of the key `crs`, empty if there is none. Raises ValueError: it is no word; one line."""
+    return parse_word(value, "crs") if "crs" in value else ""
+
+
 def beside(where: str, value: dict[str, Any], key: str) -> Path:
     """The path that a key says, beside the file with which `where` begins."""
     return Path(where.rpartition(": ")[0]).parent / parse_word(value, key)

@@ -25,6 +25,12 @@ NAMED = 3  # places that a note names
 STEEP, NEARLY_ALL_IMAGES = 0.7, 0.9
 """Cosine of an angle from the vertical within which images say what is up, and the share of them that must agree."""
 
+ON_ITS_HEAD = (
+    "the scene stands on its head, and would fit as well if an axis were mirrored: are two axes swapped, or is one "
+    "reversed?"
+)
+"""Note on places in a plane, which fit a scene that is turned over as well."""
+
 
 def off_by(
     away: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
