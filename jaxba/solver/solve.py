@@ -328,7 +328,7 @@ def solution_of(
     if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
         end = Termination.ROUNDING
     return Solution(
-        problem=setup.problem_at(state) if count else _unchanged(counted),
+        problem=setup.problem_at(state) if count else _unchanged(setup.problem),
         initial_cost=initial_cost,
         final_cost=final_cost,
         iterations=count,

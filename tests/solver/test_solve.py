@@ -16,6 +16,7 @@ from jaxba import (
     Ceres,
     Classic,
     Loss,
+    ProblemWarning,
     Schedule,
     StepOptions,
     Termination,
@@ -267,6 +268,20 @@ def test_a_solve_ends_at_the_first_cost_that_is_good_enough(callback, monkeypatc
     assert solution.compile_s == 0  # of the second
     above = solve(support.tiny(), tolerances=Tolerances(target=0.9 * float(costs[-1])), callback=callback)
     assert above.termination == Termination.COST
+
+
+def test_without_iterations_views_of_images_that_face_away_stay():
+    problem = support.tiny()
+    cameras = np.array(problem.cameras)
+    turn = np.diag([-1.0, 1.0, -1.0]) @ geometry.rotation_matrices(cameras[:1, :3])[0]
+    center = geometry.camera_centers(cameras)[0]
+    cameras[0, :3] = geometry.angle_axis(turn[None])[0]
+    cameras[0, 3:6] = -turn @ center
+    turned = problem.replace(cameras=cameras)
+    with pytest.warns(ProblemWarning, match="face away|faces away"):
+        found = solve(turned, max_iterations=0)
+    assert list(found.set_aside) == [0]
+    assert found.problem.num_observations == problem.num_observations
 
 
 def test_convergence_comes_before_the_wish_to_stop():
