@@ -13,6 +13,10 @@ WRONG = {
         lambda p: jaxba.SolveOptions(tolerances=jaxba.Tolerances(ftol="1e-6")),
         "ftol must be real numbers",
     ),
+    "a limit of time": (
+        lambda p: jaxba.SolveOptions(tolerances=jaxba.Tolerances(seconds="soon")),
+        "seconds must be real numbers, not 'soon'",
+    ),
     "within": (lambda p: jaxba.SolveOptions(within=[1, 2]), "within must be one number, not [1, 2]"),
     "no within": (lambda p: jaxba.SolveOptions(within=None), "within must be"),
     "an array": (

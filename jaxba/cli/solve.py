@@ -176,6 +176,9 @@ class Stop:
     within: float = DEFAULTS.within
     """Stop when the cost is estimated to be nearer to its end, relatively: 1e-3 where 0.1% does not matter."""
 
+    seconds: float | None = None
+    """Limit of time, compilation included."""
+
     retriangulate: bool = False
     """After convergence, move points to depths with a lower cost and go on."""
 
@@ -268,7 +271,7 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
             coordinates=replace(trained, scaling=scaling, rotation=rotation),
             intrinsics=args.intrinsics,
             loss=Loss(args.loss, args.loss_scale),
-            tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
+            tolerances=Tolerances(args.ftol, args.xtol, args.gtol, seconds=args.seconds),
             within=args.within,
             max_iterations=args.max_iterations,
             pad={"auto": None, "yes": True, "no": False}[args.pad],

@@ -43,6 +43,7 @@ class Termination(enum.IntEnum):
     NO_WEIGHT = 10
     WITHIN = 11
     NOTHING = 12
+    TIME_LIMIT = 13
 
     @property
     def converged(self) -> bool:
@@ -65,6 +66,7 @@ _REASONS = {
     Termination.NO_WEIGHT: "every residual lies beyond the scale of the loss, so that no observation has a weight: "
     "choose a larger scale, or another loss",
     Termination.MAX_ITERATIONS: "iteration limit",
+    Termination.TIME_LIMIT: "time limit",
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
     Termination.WITHIN: "estimated as near to the end as asked for",
@@ -75,7 +77,7 @@ _REASONS = {
 
 
 class Tolerances(NamedTuple):
-    """Tolerances of the convergence tests, and a target cost. The defaults are those of Ceres.
+    """Tolerances of the convergence tests, a target cost and a limit of time. The defaults are those of Ceres.
 
     `ftol` and `xtol` apply to accepted steps. Rejected steps end a solve by `lost_in_rounding`."""
 
@@ -94,6 +96,11 @@ class Tolerances(NamedTuple):
     within: float = 0.0
     """Estimated relative distance of the cost to its end at which a solve ends (`distance_to_end`); 0 switches it
     off."""
+
+    seconds: float | None = None
+    """Limit of seconds of a solve from its call on, set-up and compilation included; None: no limit. The solve ends
+    after what runs then, an iteration or a compilation, and gives the best state so far: if that was before the first
+    iteration the start, with a ProblemWarning. `solve_loop` does not know this limit."""
 
 
 def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:

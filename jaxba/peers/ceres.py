@@ -208,8 +208,9 @@ def solve_by_ceres(
 
     In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead of angles).
     `parameter_norm` and `damping_fraction` are NaN. `mode` is a key of `LINEAR_SOLVERS`, followed by `INNER` for Ceres'
-    inner iterations. The target cost is ignored. `callback` is called after every iteration; a true return value stops
-    the solve. Raises ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses."""
+    inner iterations. The target cost and the limit of time are ignored. `callback` is called after every iteration; a
+    true return value stops the solve. Raises ProblemError: the initial cost is not finite, or the problem has
+    covariances or shared lenses."""
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
     options = solver_options(mode, threads)

@@ -8,7 +8,7 @@ import operator
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from jaxba.problem.checks import shown
+from jaxba.problem.checks import real_number, shown
 from jaxba.problem.losses import Loss
 from jaxba.typing import LARGEST_COUNT
 
@@ -208,6 +208,13 @@ def check_count(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name} must be at least {least}, is {value}")
     if count > LARGEST_COUNT:
         raise ValueError(f"{name} must be at most {LARGEST_COUNT}, is {value}")
+
+
+def check_limit(name: str, value: Any) -> None:
+    """Raises ValueError: an option is neither None, which is no limit, nor a positive number; one line with its
+    name."""
+    if value is not None and not real_number(name, value) > 0:
+        raise ValueError(f"{name} must be positive, is {value}")
 
 
 EMBEDDED = Refinement(points=3, starts="rays", trials=4, camera_rounds=3, pattern_moves=1)

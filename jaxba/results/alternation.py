@@ -21,6 +21,7 @@ from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
 from jaxba.solver.solve import Solution
 from jaxba.solver.start import as_measured
+from jaxba.solver.time_limit import TimeLimit
 
 MAX_ROUNDS = 5
 """Most retriangulations. Source: COLMAP, ba_global_max_refinements."""
@@ -45,8 +46,8 @@ def solve_and_retriangulate(
     Args:
         problem: start of the optimisation.
         policy: as for `solve`.
-        options: as for `solve`; `max_iterations` limits all solves together. Retriangulation uses the same loss, in
-            float64 and without padding.
+        options: as for `solve`; `max_iterations` and `Tolerances.seconds` limit all solves together. Retriangulation
+            uses the same loss, in float64 and without padding.
         callback: as for `solve`; iterations and seconds are counted over all solves.
         on_search: called after every retriangulation, including the last one, whose result is discarded if the decrease
             is too small (`Retriangulation.pays`).
@@ -54,12 +55,15 @@ def solve_and_retriangulate(
         verbose: as for `solve`."""
     check_problem(problem)
     options = checked_options(options)
-    check_problem(problem)
+    limit = TimeLimit(options)
     problem = as_measured(problem)
     callback, waiting = shown(callback, verbose)
     away = set_aside(problem)
-    solves = Consecutive(policy, callback, watch, waiting)
-    run = lambda problem, limit: solves.solve(away, problem, replace(options, max_iterations=limit), problem)
+    solves = Consecutive(policy, callback, watch, waiting, limit)
+
+    def run(problem: BundleProblem, iterations: int) -> None:
+        solves.solve(away, problem, replace(options, max_iterations=iterations), problem)
+
     run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
         solution = solves.total
@@ -77,4 +81,5 @@ def solve_and_retriangulate(
         if not found.pays(options.tolerances.ftol):
             break
         run(found.problem, options.max_iterations - solution.iterations)
+    limit.warn_if_too_short(solves.total.termination, solves.total.iterations)
     return solves.total

@@ -5,7 +5,6 @@ Source: COLMAP 4.2, `BundleAdjustmentController`, `DefaultBundleAdjuster`, `Pose
 from __future__ import annotations
 
 import importlib
-import time
 import warnings
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -33,9 +32,15 @@ from jaxba.results.retriangulate import retriangulate
 from jaxba.solver.drivers import Callback
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import Solution, solve
+from jaxba.solver.time_limit import TimeLimit
 
-TOLERANCES = {"function_tolerance": "ftol", "gradient_tolerance": "gtol", "parameter_tolerance": "xtol"}
-"""COLMAP's tolerances by name, as those of `Tolerances`."""
+TOLERANCES = {
+    "function_tolerance": "ftol",
+    "gradient_tolerance": "gtol",
+    "parameter_tolerance": "xtol",
+    "max_solver_time_in_seconds": "seconds",
+}
+"""COLMAP's tolerances and its limit of time by name, as those of `Tolerances`."""
 
 NEVER = SimpleNamespace(is_cancelled=False)
 """A token that stops nothing."""
@@ -120,7 +125,8 @@ class BundleAdjuster:
         check_reconstruction(self.reconstruction)
         options = options_of(self.options)
         chosen = solve_options(options)
-        callback = _stops(options, self.token)
+        limit = TimeLimit(chosen)
+        callback = _stop_of(self.token)
         try:
             problem, moves, behind = self._problem(options)
             if behind and self.deletes:
@@ -129,9 +135,9 @@ class BundleAdjuster:
         except NothingObserved:
             return BundleAdjustmentSummary.nothing()
         if behind or any_far_off(problem, self.reconstruction):
-            solution = _solve_after_search(problem, chosen, callback)
+            solution = _solve_after_search(problem, chosen, limit, callback)
         else:
-            solution = solve(problem, options=chosen, callback=callback)
+            solution = solve(problem, options=limit.rest(chosen), callback=callback)
         for move in moves:
             _transform(self.reconstruction, move)
         solution.update(self.reconstruction)
@@ -153,10 +159,12 @@ class BundleAdjuster:
         return problem, moves, seen is not part
 
 
-def _solve_after_search(problem: BundleProblem, options: SolveOptions, callback: Callback | None) -> Solution:
+def _solve_after_search(
+    problem: BundleProblem, options: SolveOptions, limit: TimeLimit, callback: Callback | None
+) -> Solution:
     """A solve from points that were searched with the cameras held, since no step leads back those that are far off."""
     searched = retriangulate(problem, options.loss)
-    solution = solve(searched.problem, options=options, callback=callback)
+    solution = solve(searched.problem, options=limit.rest(options), callback=callback)
     return replace(solution, initial_cost=searched.cost_before)
 
 
@@ -177,18 +185,15 @@ def _transform(reconstruction: Any, by: Similarity) -> None:
     reconstruction.transform(pycolmap.Sim3d(float(by.scale), rotation, np.asarray(by.translation)))
 
 
-def _stops(options: Any, token: Any) -> Callback | None:
-    """What stops a solve between iterations: a time limit of the options, or a token. Raises ValueError: no token."""
+def _stop_of(token: Any) -> Callback | None:
+    """What stops a solve between iterations: a token. Raises ValueError: no token."""
     if not hasattr(token, "is_cancelled"):
         raise ValueError(f"cancellation_token must be a pycolmap.CancellationToken, not {shown(token)}")
-    if token is NEVER and not changed(options, "max_solver_time_in_seconds"):
-        return None
-    end = time.perf_counter() + ceres_options(options).solver_options.max_solver_time_in_seconds
 
-    def stop(record: Any) -> bool:
-        return token.is_cancelled or time.perf_counter() >= end
+    def is_cancelled(record: Any) -> bool:
+        return token.is_cancelled
 
-    return stop
+    return None if token is NEVER else is_cancelled
 
 
 def solve_options(options: Any) -> SolveOptions:

@@ -10,18 +10,23 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
+from jaxba.lm.termination import Termination
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.drivers import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.progress import Waiting
 from jaxba.solver.solve import Solution, solve_without
+from jaxba.solver.time_limit import TimeLimit
+
+STOPS = (Termination.STOPPED, Termination.TIME_LIMIT)
+"""Ends of a solve after which no other one goes on."""
 
 
 class Consecutive:
-    """Solves with one policy. Callback and watch count iterations and seconds over all of them."""
+    """Solves with one policy and one time limit. Callback and watch count iterations and seconds over all of them."""
 
     stopped = False
-    """Whether the callback has asked to stop."""
+    """Whether the callback has asked to stop, or the time limit is over."""
 
     def __init__(
         self,
@@ -29,8 +34,10 @@ class Consecutive:
         callback: Callback | None,
         watch: Watch | None,
         waiting: Waiting,
+        limit: TimeLimit,
     ) -> None:
         self._policy, self._callback, self._watch, self._waiting = policy, callback, watch, waiting
+        self._limit = limit
         self.done: list[Solution] = []
 
     @property
@@ -55,7 +62,8 @@ class Consecutive:
 
         seen = watch and (lambda record, now: watch(of_all(record), lambda: with_parameters(whole, now())))
         hooks = {"callback": forward, "watch": seen, "waiting": self._waiting}
-        found = solve_without(away, problem, self._policy, options, **hooks)
+        found = solve_without(away, problem, self._policy, self._limit.rest(options), **hooks)
+        self.stopped |= found.termination == Termination.TIME_LIMIT
         self.done.append(found)
         return found
 
@@ -67,9 +75,10 @@ def with_parameters(problem: BundleProblem, found: BundleProblem) -> BundleProbl
 
 
 def joined(before: Solution, last: Solution) -> Solution:
-    """The solution of two consecutive solves together."""
+    """The solution of two consecutive solves together. One that follows a stopped one only computes costs."""
     return replace(
         last,
+        termination=before.termination if before.termination in STOPS else last.termination,
         initial_cost=before.initial_cost,
         start=before.start,
         iterations=before.iterations + last.iterations,

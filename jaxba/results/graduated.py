@@ -37,6 +37,7 @@ from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
 from jaxba.solver.solve import Solution
 from jaxba.solver.start import as_measured
+from jaxba.solver.time_limit import TimeLimit
 
 FIRST, LAST = 2.0, 4.0
 """Scale at the start, and the residual beyond which a match is rejected, in medians of the residuals. With normal noise
@@ -82,6 +83,7 @@ def solve_graduated(
         problem: start of the optimisation.
         policy: as for `solve`.
         options: as for `solve`; `max_iterations` limits the last solve, those before are limited by `STAGE_ITERATIONS`.
+            `Tolerances.seconds` limits all together; then residuals at that moment say which observations are gone.
         max_residual: largest residual of a right match, whitened; 0: `LAST` times the median. It is that of a
             point that many images see. The fewer see it, the better it fits them, so that one of n has
             `sqrt(1 - 3/(2n))` of it.
@@ -90,13 +92,14 @@ def solve_graduated(
         verbose: as for `solve`."""
     check_problem(problem)
     options = checked_options(options)
+    limit = TimeLimit(options)
     if not problem.num_observations:
         raise ProblemError("the problem has no observations, of which wrong ones might be rejected")
     if not max_residual >= 0:
         raise ValueError(f"max_residual must not be negative, is {max_residual}")
     problem = as_measured(problem)
     callback, waiting = shown(callback, verbose)
-    solves = Consecutive(policy, callback, watch, waiting)
+    solves = Consecutive(policy, callback, watch, waiting, limit)
     away = facing_away(problem)
     counted = ~np.isin(problem.camera_index, away)
     every = np.ones(problem.num_observations, bool)
@@ -104,7 +107,7 @@ def solve_graduated(
     kept, lost = _fitting(found, scale)
     poses = constants_of(problem.constants, problem.num_cameras, problem.num_points).poses
     again = NO_CAMERAS if problem.rigs else lost[~np.asarray(poses)[lost].any(axis=1)]
-    if len(again) and kept.any():
+    if len(again) and kept.any() and not solves.stopped:
         found = _posed_again(solves, found, again, kept, options, scale)
         found, scale = _descend(solves, found, NO_CAMERAS, options, FALL * scale, max_residual)
         kept, lost = _fitting(found, scale)
@@ -117,8 +120,9 @@ def solve_graduated(
     seen = observed(problem.subset(kept))[1][:, None]
     found = found.replace(points=np.where(seen, found.points, problem.points))
     none = replace(options, max_iterations=0)
-    start = Consecutive(policy, None, None, waiting).solve(NO_CAMERAS, problem.subset(kept), none, problem)
+    start = Consecutive(policy, None, None, waiting, limit).solve(NO_CAMERAS, problem.subset(kept), none, problem)
     last = solves.solve(NO_CAMERAS, found.subset(kept), none if solves.stopped else options, found)
+    limit.warn_if_too_short(solves.total.termination, solves.total.iterations)
     return replace(
         solves.total,
         problem=with_parameters(problem, last.problem),

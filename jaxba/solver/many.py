@@ -34,6 +34,7 @@ from jaxba.solver.place import check_problem, placed
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.solve import Solution, solution_of, solve
 from jaxba.solver.start import as_measured
+from jaxba.solver.time_limit import TimeLimit
 from jaxba.structure.cells import NO_CELL, Sizes, cell_for, choose_cells
 
 BANK = 32  # problems of a bank for each lane; on a CPU it has one lane, and half a second of work
@@ -64,9 +65,9 @@ def solve_many(
     before any program for many is compiled; problems of sizes that are rare are solved by `solve`. An endless stream
     runs in constant memory: at most `AHEAD` problems are read before their turn.
 
-    Lanes are for the method `lm` with a factorisation, on one device each; with other options every problem is solved
-    by `solve`. Problems with lenses, rigs or residuals share a program where they have as many cameras, and as many
-    rows of each residual.
+    Lanes are for the method `lm` with a factorisation, on one device each; with other options, and with a limit of
+    time, which is that of each problem from when its solve begins, every problem is solved by `solve`. Problems with
+    lenses, rigs or residuals share a program where they have as many cameras, and as many rows of each residual.
 
     Args:
         problems: starts of the optimisation, read by the thread that asks for results; an exception among them, for one
@@ -155,7 +156,7 @@ class _Many:
         self._lock = threading.Lock()
         plain = options.linear_solver in ("auto", "explicit") and not options.step_options(policy).method
         one_device = options.devices in (None, 1)
-        self._in_lanes = plain and options.max_iterations > 0 and one_device
+        self._in_lanes = plain and options.max_iterations > 0 and one_device and not TimeLimit(options).exists
         # two solves on several devices at a time would wait for each other
         self._threads = len(self._devices) if one_device else 1
         self._pool = ThreadPoolExecutor(self._threads)
@@ -320,7 +321,8 @@ class _Program:
         rows += [rows[-1]] * (size - len(rows))
         starts = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         limit, used = (np.asarray(n, np.int32) for n in (options.max_iterations, len(setups)))
-        given = starts, one.policy, options.tolerances, limit, used, one.options, record_length(int(limit)), lanes
+        tolerances = options.tolerances._replace(seconds=None)
+        given = starts, one.policy, tolerances, limit, used, one.options, record_length(int(limit)), lanes
         return jax.tree.map(np.asarray, self._programs.run(self._function, *given))
 
 

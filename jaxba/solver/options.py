@@ -20,6 +20,7 @@ from jaxba.problem.options import (
     StepOptions,
     check_count,
     check_known,
+    check_limit,
 )
 from jaxba.runtime.compilation import Compilation
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
@@ -73,7 +74,7 @@ class SolveOptions:
     """Robust loss."""
 
     tolerances: Tolerances = field(default_factory=Tolerances)
-    """Convergence tests."""
+    """Convergence tests, and the limit of time."""
 
     within: float = 0.0
     """Estimated relative distance to the end that is near enough, `Tolerances.within`; 0: no such test."""
@@ -119,7 +120,9 @@ class SolveOptions:
             object.__setattr__(self, "tolerances", self.tolerances._replace(within=self.within))
         if self.devices is not None:
             check_count("devices", self.devices, 1)
-        for name, value in self.tolerances._asdict().items():
+        tests = self.tolerances._asdict()
+        check_limit("seconds", tests.pop("seconds"))
+        for name, value in tests.items():
             if not real_number(name, value) >= 0:
                 raise ValueError(f"{name} must not be negative, is {value}")
 

@@ -11,9 +11,10 @@ from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import check_count
 from jaxba.runtime import process
-from jaxba.solver.options import SolveOptions
+from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve
+from jaxba.solver.time_limit import TimeLimit
 
 RECIPES = (DEFAULT_POLICY, "ceres+embedded", "nielsen+embedded")
 """The policy that is asked for takes the place of the first one."""
@@ -26,10 +27,13 @@ def solve_recipes(
     options: SolveOptions | None = None,
 ) -> list[Solution]:
     """Solves a problem with a policy, and with the next ones of `RECIPES`, `count` in all, on as many cores. Returns
-    all solutions; `min(found, key=lambda one: one.final_cost)` is the best. Each compiles a program of its own. Raises
-    as `solve`; ValueError: there are not so many recipes."""
+    all solutions; `min(found, key=lambda one: one.final_cost)` is the best. Each compiles a program of its own. A limit
+    of time (`Tolerances.seconds`) is that of all together. Raises as `solve`; ValueError: there are not so many
+    recipes."""
     check_count("count", count, 1)
     if count > len(RECIPES):
         raise ValueError(f"there are 1 to {len(RECIPES)} recipes, not {count}")
+    options = checked_options(options)
+    limit = TimeLimit(options)
     with ThreadPoolExecutor(process.threads()) as pool:
-        return list(pool.map(lambda one: solve(problem, one, options), (policy, *RECIPES[1:count])))
+        return list(pool.map(lambda one: solve(problem, one, limit.rest(options)), (policy, *RECIPES[1:count])))

@@ -34,6 +34,7 @@ from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.progress import SILENT, Waiting, shown
 from jaxba.solver.start import as_measured
 from jaxba.solver.stepwise import Stepwise, iterations_before
+from jaxba.solver.time_limit import TimeLimit
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
 
@@ -217,7 +218,8 @@ def solve(
         watch: called before it, with the record and a function that gives the problem with the parameters after the
             iteration; the time that it takes is not counted.
         verbose: whether a row is printed for every iteration, and a line while programs compile.
-        checkpoint: file that is written once a minute and at the end, and from which the same solve continues.
+        checkpoint: file that is written once a minute and at the end, and from which the same solve continues; the
+            time of an earlier run does not count for `Tolerances.seconds`.
 
     Returns:
         The optimised problem in NumPy float64 arrays, histories and timings.
@@ -234,15 +236,18 @@ def solve(
             raise ValueError(f"{name} must be a function")
     callback, waiting = shown(callback, verbose)
     hooks: dict[str, Any] = {"callback": callback, "waiting": waiting}
+    options = checked_options(options)
+    limit = TimeLimit(options)
     check_problem(problem)
-    if checked_options(options).max_iterations:
+    if options.max_iterations:
         problem = as_measured(problem)
     part = observed_part(problem)
     whole = functools.partial(part.whole, problem)
     watched = watch and (lambda record, now: watch(record, lambda: whole(now())))
     if checkpoint:
-        hooks["checkpoint"] = Checkpoint(checkpoint, part.problem, policy, checked_options(options))
-    found = solve_without(None, part.problem, policy, options, watch=watched, **hooks)
+        hooks["checkpoint"] = Checkpoint(checkpoint, part.problem, policy, options)
+    found = solve_without(None, part.problem, policy, limit.rest(options), watch=watched, **hooks)
+    limit.warn_if_too_short(found.termination, found.iterations)
     start = problem if problem.residuals else None
     return replace(found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside], start=start)
 
@@ -260,10 +265,16 @@ def solve_without(
 ) -> Solution:
     """`solve` where it is known which images face away; None: it is not. `waiting` is told what takes time."""
     options = checked_options(options)
+    limit = TimeLimit(options)
     saved = checkpoint and checkpoint.load()
     problem, away = (saved.problem, saved.away) if saved else (problem, away)
     setup = set_up(problem, policy, options, away, in_parts=True, tell=waiting.tell)
-    alone = not (callback or watch or checkpoint)
+    steps, records = None, saved.steps if saved else []
+    end = Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
+    if end == Termination.RUNNING and limit.is_over():
+        end = Termination.TIME_LIMIT
+        options = replace(options, max_iterations=0)  # the cost of the start needs no program of a step
+    alone = not (callback or watch or checkpoint or limit.exists)
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
         driver.compiling = waiting.compiling
@@ -273,11 +284,11 @@ def solve_without(
         initial_cost, compiled, watched, began = float(state.cost), driver.compile_s(), 0.0, time.perf_counter()
         initial_cost, before_s = (saved.initial_cost, saved.total_s) if saved else (initial_cost, 0.0)
         elapsed = lambda: before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
-        steps, records = None, saved.steps if saved else []
-        end = Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
         if saved and end == Termination.RUNNING:
             driver.carry = saved.continued(driver.carry)
             waiting.resume(len(records), before_s)
+        if end == Termination.RUNNING and limit.is_over():
+            end = Termination.TIME_LIMIT
         if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
             steps, end = driver.finish()
         while end == Termination.RUNNING and not isinstance(driver, Compiled):
@@ -291,6 +302,8 @@ def solve_without(
             watched += time.perf_counter() - looked
             if callback and callback(record) and end == Termination.RUNNING:
                 end = Termination.STOPPED
+            if end == Termination.RUNNING and limit.is_over():
+                end = Termination.TIME_LIMIT
             looked = time.perf_counter()
             if checkpoint and (checkpoint.due or end != Termination.RUNNING):
                 now = setup.problem_at(driver.carry.state), setup.away, initial_cost, record.time_s, records
@@ -349,7 +362,8 @@ def solution_of(
 
 def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Compiled | OnDevices | Stepwise:
     """The way to run the iterations: in stages of compilation, or where somebody looks at them, from Python."""
-    arguments = setup, options.tolerances, options.max_iterations, clock
+    tolerances = options.tolerances._replace(seconds=None)  # with which programs are the same as without a limit
+    arguments = setup, tolerances, options.max_iterations, clock
     if setup.shards is not None:
         return OnDevices(setup.shards, *arguments)
     first = iterations_before(options.compilation, len(setup.placed.here.camera_index), setup.options)

@@ -6,6 +6,7 @@ The truth is pycolmap itself, or the same views from a start at the true points.
 from __future__ import annotations
 
 import copy
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -238,11 +239,27 @@ def test_a_token_stops_the_solve_in_the_third_place_and_by_name(start):
         jaxba.bundle_adjustment(copy.deepcopy(start), quiet(), "all")
 
 
-def test_a_time_limit_ends_the_solve(start):
+def test_a_time_limit_ends_the_solve(start, monkeypatch):
+    seconds = itertools.count()  # one passes whenever somebody looks
+    monkeypatch.setattr("jaxba.solver.time_limit.clock", lambda: float(next(seconds)))
     model = copy.deepcopy(start)
-    summary = jaxba.bundle_adjustment(model, quiet(max_solver_time_in_seconds=1e-6))
-    assert summary.iterations == 1
+    summary = jaxba.bundle_adjustment(model, quiet(max_solver_time_in_seconds=4.5))
+    assert summary.termination == jaxba.Termination.TIME_LIMIT
+    assert summary.termination_type == TYPES.NO_CONVERGENCE
+    assert summary.is_solution_usable()
+    assert summary.iterations > 0
     assert cost(model) < cost(start)
+
+
+def test_a_time_limit_below_the_set_up_leaves_the_start_as_in_colmap(start):
+    ours, theirs = copy.deepcopy(start), copy.deepcopy(start)
+    options = quiet(max_solver_time_in_seconds=1e-6)
+    with pytest.warns(jaxba.ProblemWarning, match="the time limit was over before the first iteration"):
+        summary = jaxba.create_default_bundle_adjuster(options, configuration(ours), ours).solve()
+    expected = pycolmap.create_default_bundle_adjuster(options, configuration(theirs), theirs).solve()
+    assert summary.iterations == 0
+    assert summary.termination_type == expected.termination_type == TYPES.NO_CONVERGENCE
+    assert cost(ours) == pytest.approx(cost(theirs), rel=1e-12)
 
 
 def test_what_is_ignored_and_would_change_the_end_is_named(start):

@@ -292,6 +292,9 @@ def test_two_processes_solve_as_one_and_end_together(tmp_path):
     problem = jaxba.with_residual(jaxba.read_problem(file), bars)
     one = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).costs["pixels"]
     np.testing.assert_allclose(geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9)
+    statuses, printed = run_two(file, tmp_path / "start.txt", "--seconds", "1e-6")
+    assert statuses == [0, 0], printed
+    assert "not converged: time limit" in printed[0]
 
 
 @pytest.mark.slow
