@@ -77,7 +77,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     seen = set()
     for item in items:
         whole = item.path.parent.name in WHOLE_ROOMS
-        slow = item.get_closest_marker("slow") is not None
+        marker = item.get_closest_marker("slow")
+        slow = marker is not None
+        if marker is not None and marker.args:
+            continue
         test = (
             item.path.parent if item.path.parent.name in LABORATORY else item.path,
             slow,

@@ -75,8 +75,8 @@ def looked_up(file: Path, placed: Placed, own: Int[np.ndarray, " n"], image: int
     if np.mean(inside) < COVERED and not (placed.sizes[image] > 0).all():
         outside = f"{np.sum(~inside)} of {len(own)} pixels of its image lie outside"
         raise ValueError(f"{file}: is {width} x {height}, and {outside}: maps have the size of their images")
-    found = depths[np.where(inside, row, 0), np.where(inside, column, 0)]
-    return np.where(inside & (found > 0) & np.isfinite(found), found, np.nan)
+    depth = depths[np.where(inside, row, 0), np.where(inside, column, 0)]
+    return np.where(inside & (depth > 0) & np.isfinite(depth), depth, np.nan)
 
 
 def _scale(file: Path, size: Float[np.ndarray, "2"], of_image: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
@@ -110,13 +110,14 @@ def refuse_disparities(
         depths: those of the points."""
     from scipy.stats import rankdata
 
-    found = []
+    correlations = []
     for number in range(int(image.max()) + 1):
-        own = image == number
-        if own.sum() >= LEAST_PIXELS and np.ptp(measured[own]) > 0 and np.ptp(depths[own]) > 0:
-            found.append(float(np.corrcoef(rankdata(measured[own]), rankdata(depths[own]))[0, 1]))
-    if found and np.mean(found) < OPPOSITE:
+        of_image = image == number
+        if of_image.sum() >= LEAST_PIXELS and np.ptp(measured[of_image]) > 0 and np.ptp(depths[of_image]) > 0:
+            correlations.append(float(np.corrcoef(rankdata(measured[of_image]), rankdata(depths[of_image]))[0, 1]))
+    mean = float(np.mean(correlations)) if correlations else 0.0
+    if mean < OPPOSITE:
         raise ValueError(
-            f"{folder}: maps are smaller where points are farther (rank correlation {np.mean(found):.2f}): they seem "
+            f"{folder}: maps are smaller where points are farther (rank correlation {mean:.2f}): they seem "
             "to have disparities, not depths; give their inverse"
         )

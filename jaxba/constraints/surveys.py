@@ -54,11 +54,11 @@ def with_positions(
         places = places * np.where(np.isnan(given.units), 1.0, given.units)[[0, 0, 1]]
     assert covariances is not None
     covariances = covariances[kept]
-    found = with_position_priors(problem, places, covariances, images=images.tolist(), loss=loss, align=align)
-    if align and crs and on_its_head(found):
-        centres = camera_centers(found.cameras)[images]
+    problem = with_position_priors(problem, places, covariances, images=images.tolist(), loss=loss, align=align)
+    if align and crs and on_its_head(problem):
+        centres = camera_centers(problem.cameras)[images]
         report([f"{where}: {ON_ITS_HEAD}"] if check_axes(centres, places, covariances) else [])
-    return found, frame
+    return problem, frame
 
 
 def _with_a_place(
@@ -140,6 +140,6 @@ def _photos(problem: BundleProblem, where: str, folder: Path, strict: bool) -> P
     if problem.labels is None:
         raise ValueError("photos: the problem does not name its images")
     names = problem.labels.names
-    found = read_photos(folder, names)
-    leave_out(where, "photo", "{} without a position", sorted({*names} - {*found.names}), strict)
-    return found
+    positions = read_photos(folder, names)
+    leave_out(where, "photo", "{} without a position", sorted({*names} - {*positions.names}), strict)
+    return positions

@@ -132,15 +132,15 @@ def _scales(source: Any, called: str, units: Sequence[float], where: str) -> Flo
     without heights are metres. Notes in which unit heights are, where the file does not say it and it is no metre."""
     axes = source.axis_info
     flat, up = (1.0 if source.is_geographic else axes[0].unit_conversion_factor), axes[min(2, len(axes) - 1)]
-    own = up.unit_conversion_factor if len(axes) > 2 or not source.is_geographic else 1.0
+    unit_of_system = up.unit_conversion_factor if len(axes) > 2 or not source.is_geographic else 1.0
     horizontal = units[0] / flat if np.isfinite(units[0]) and not source.is_geographic else 1.0
     if abs(horizontal - 1) < SAME_UNIT:
         horizontal = 1.0
     said = np.isfinite(units[1])
-    height = units[1] if said and abs(units[1] / own - 1) > SAME_UNIT else own
-    if not said and own != 1.0:
+    height = units[1] if said and abs(units[1] / unit_of_system - 1) > SAME_UNIT else unit_of_system
+    if not said and unit_of_system != 1.0:
         report([f"{where}: heights are taken in the unit of {called}: {up.unit_name}"])
-    return np.array([horizontal, horizontal, height / (own if len(axes) > 2 else 1.0)])
+    return np.array([horizontal, horizontal, height / (unit_of_system if len(axes) > 2 else 1.0)])
 
 
 def _middle(positions: Float[np.ndarray, "n 3"], source: Any) -> Frame:
@@ -197,15 +197,15 @@ def _transformed(positions: Float[np.ndarray, "n 3"], source: Any, target: Any) 
     from pyproj.exceptions import ProjError
 
     transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
-    found = np.stack(transformer.transform(*positions.T), axis=1)
-    bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    transformed = np.stack(transformer.transform(*positions.T), axis=1)
+    bad = np.flatnonzero(~np.isfinite(transformed).all(axis=1))
     if bad.size:
         raise ValueError(f"{positions[bad[0]].tolist()} is no place of {source.name}")
     try:
         used = transformer.get_last_used_operation().description
     except ProjError:  # both systems are the same
         used = ""
-    return found, _missing_grid(source, target) if "ballpark vertical" in used else ""
+    return transformed, _missing_grid(source, target) if "ballpark vertical" in used else ""
 
 
 def _missing_grid(source: Any, target: Any) -> str:

@@ -75,7 +75,7 @@ def costs_by_kind(problem: BundleProblem) -> dict[str, float]:
     return found
 
 
-def costs_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, " rows"]]:
+def costs_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, " _"]]:
     """The cost of every row of `problem.residuals.rows`."""
     found = residuals_of_rows(problem)
     with numerics(np.float64):
@@ -83,7 +83,7 @@ def costs_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, " rows"]]:
         return [np.asarray(row_costs(rows, jnp.asarray(residual.T))) for rows, residual in pairs]
 
 
-def residuals_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, "rows size"]]:
+def residuals_of_rows(problem: BundleProblem) -> list[Float[np.ndarray, "_ _"]]:
     """What the functions return for every row of `problem.residuals.rows`, without the losses."""
     with numerics(np.float64):
         kinds, of, at, _ = rows_of(problem)

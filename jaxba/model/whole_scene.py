@@ -61,7 +61,7 @@ class Moves(NamedTuple):
     scale: Float[np.ndarray, " n"]
     rotation: Float[np.ndarray, "n 3 3"]
     translation: Float[np.ndarray, "n 3"]
-    blocks: tuple[Float[np.ndarray, "n rows numbers"], ...]
+    blocks: tuple[Float[np.ndarray, "n _ _"], ...]
 
 
 class Expansion(NamedTuple):
@@ -82,7 +82,7 @@ class WholeScene:
     cameras: Float[np.ndarray, "parameters cameras"]
     points: Float[np.ndarray, "3 points"]
     groups: tuple[Int[np.ndarray, " cameras"], ...]  # the row of each block that each camera has; negative for none
-    blocks: tuple[Float[np.ndarray, "rows numbers"], ...]
+    blocks: tuple[Float[np.ndarray, "_ _"], ...]
     shares: tuple[float, ...]  # rows of each residual over those that are asked
     middle: Float[np.ndarray, "3"]
     extent: float
@@ -110,7 +110,7 @@ class WholeScene:
     @numerics(np.float64)  # spinning threads of BLAS made small eigenvalue problems 200 times slower on a busy machine
     def minimised(
         self, directions: Float[np.ndarray, "7 free"]
-    ) -> tuple[Similarity, tuple[Float[np.ndarray, "rows numbers"], ...], float]:
+    ) -> tuple[Similarity, tuple[Float[np.ndarray, "_ _"], ...], float]:
         """The similarity in the span of some directions with the least cost, the blocks with it, and its cost as a
         share of the cost without it. Where nothing is determined it is the identity, and blocks alone are found."""
         free = _moves_freely(directions)
@@ -320,7 +320,7 @@ def _expansions(
                     parts.append(jnp.where(group >= 0, changed[jnp.maximum(group, 0)].T, 0.0))
                     start += block.size
                 state = jnp.concatenate(parts)
-            found = []
+            of_kinds = []
             for kind in kinds:
                 rows = kind.rows
                 seen = jnp.asarray(rows.scale) * jnp.asarray(rows.rotation)
@@ -330,8 +330,8 @@ def _expansions(
                     rotation=jnp.asarray(rows.rotation) @ rotation,
                     translation=seen @ shift + jnp.asarray(rows.translation),
                 )
-                found.append(values(replace(kind, rows=frame), unknowns, state, points))
-            return found
+                of_kinds.append(values(replace(kind, rows=frame), unknowns, state, points))
+            return of_kinds
 
         costs, gradients, normals = [], [], []
         for kind, at, by in zip(kinds, residuals(zero), jax.jacfwd(residuals)(zero), strict=True):

@@ -12,17 +12,17 @@ from jaxba.problem.similarity import Similarity, transformed
 
 def moved(problem: BundleProblem, by: Similarity) -> BundleProblem:
     """The problem after a similarity; constants are copied exactly. Its residuals are not moved with it."""
-    found = transformed(problem, by)
-    rigs = problem.rigs if has_size(problem) else found.rigs
-    found = found.replace(rigs=rigs, residuals=problem.residuals)
+    scene = transformed(problem, by)
+    rigs = problem.rigs if has_size(problem) else scene.rigs
+    scene = scene.replace(rigs=rigs, residuals=problem.residuals)
     constants = problem.constants
     if constants is None:
-        return found
-    cameras = np.array(found.cameras)
+        return scene
+    cameras = np.array(scene.cameras)
     held = np.asarray(constants.poses)
     cameras[:, :POSE_SIZE] = np.where(held, np.asarray(problem.cameras)[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
-    points = np.where(np.asarray(constants.points)[:, None], problem.points, found.points)
-    return found.replace(cameras=cameras, points=points)
+    points = np.where(np.asarray(constants.points)[:, None], problem.points, scene.points)
+    return scene.replace(cameras=cameras, points=points)
 
 
 def has_size(problem: BundleProblem) -> bool:

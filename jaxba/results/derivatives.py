@@ -79,7 +79,7 @@ class SolveInputs(NamedTuple):
     points: Float[AnyArray, "points 3"]
     """Points at the start; the solution depends on the constant ones."""
 
-    residuals: tuple[tuple[Float[AnyArray, "rows ..."], ...], ...] = ()
+    residuals: tuple[tuple[Float[AnyArray, "_ ..."], ...], ...] = ()
     """For the rows of each residual of the problem besides pixels (`problem.residuals.rows`) their data."""
 
     whitening: Float[AnyArray, "observations 2 2"] | None = None

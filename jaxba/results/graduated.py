@@ -35,16 +35,10 @@ from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.place import NO_CAMERAS, check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.progress import shown
+from jaxba.solver.robust import FALL, FIRST, LAST
 from jaxba.solver.solve import Solution
 from jaxba.solver.start import as_measured
 from jaxba.solver.time_limit import TimeLimit
-
-FIRST, LAST = 2.0, 4.0
-"""Scale at the start, and the residual beyond which a match is rejected, in medians of the residuals. With normal noise
-and without wrong matches the latter is 4.7 standard deviations, with 30% of them 6.3."""
-
-FALL = 2.0
-"""Scale of a stage over that of the next."""
 
 STAGES, STAGE_ITERATIONS, STAGE_FTOL = 40, 5, 1e-3
 """Most stages, and limit and `ftol` of each."""

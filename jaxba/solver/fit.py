@@ -102,7 +102,7 @@ class Left:
         at = self.kinds[kind]
         values, vectors = np.linalg.eigh(self.cofactor[at[:, :, None], at[:, None, :]])
         known = values > LEAST_REDUNDANCY
-        known[[row for own, row in self.out if own == kind]] = False
+        known[[row for of, row in self.out if of == kind]] = False
         along = np.einsum("rij,ri->rj", vectors, self.residual[at])
         squares = np.where(known, along**2 / np.where(known, values, 1.0), 0.0)
         return squares.sum(axis=1), known.sum(axis=1)
@@ -117,10 +117,10 @@ class Left:
 
     def misfit(self, kind: int) -> tuple[float, float, float]:
         """The sum of squares of a kind, its redundancy, and the trace of the square of its cofactor."""
-        gone = [row for own, row in self.out if own == kind]
+        gone = [row for of, row in self.out if of == kind]
         at = np.delete(self.kinds[kind], gone, axis=0).ravel()
-        own = self.cofactor[np.ix_(at, at)]
-        return float(np.sum(self.residual[at] ** 2)), float(np.trace(own)), float(np.sum(own**2))
+        cofactor = self.cofactor[np.ix_(at, at)]
+        return float(np.sum(self.residual[at] ** 2)), float(np.trace(cofactor)), float(np.sum(cofactor**2))
 
     def fits(self, kind: int, level: float) -> bool:
         """Whether a kind passes both tests."""
@@ -150,7 +150,7 @@ def explained(
     rest = left.without(suspects) if suspects else left
     while not rest.all_fit(level):
         excess = [rest.excess(kind, level) for kind in range(len(left.kinds))]
-        full = [sum(own == kind for own, _ in rest.out) >= limits[kind] for kind in range(len(limits))]
+        full = [sum(of == kind for of, _ in rest.out) >= limits[kind] for kind in range(len(limits))]
         largest = [0.0 if full[kind] or not x.size else float(x.max()) for kind, x in enumerate(excess)]
         kind = int(np.argmax(largest))
         if not largest[kind] > 0:
@@ -158,7 +158,7 @@ def explained(
         rest = rest.without(((kind, int(np.argmax(excess[kind]))),))
     out = rest.out
     for row in sorted(out, key=lambda row: _predicted(left, out, row)):
-        fewer = tuple(one for one in out if one != row)
+        fewer = tuple(other for other in out if other != row)
         if (left.without(fewer) if fewer else left).all_fit(level):
             out = fewer
     return out
@@ -166,15 +166,15 @@ def explained(
 
 def instead(left: Left, out: tuple[tuple[int, int], ...], row: tuple[int, int], level: float = LEVEL) -> list:
     """Other rows without which, in the place of one that is left out, all fit as well."""
-    others = tuple(one for one in out if one != row)
+    others = tuple(other for other in out if other != row)
     rest = left.without(others) if others else left
-    found = []
+    as_well = []
     for kind in range(len(left.kinds)):
         squares, _ = rest.deletions(kind)
         for other in np.argsort(-squares, kind="stable")[:MOST_OTHERS].tolist():
             if (kind, other) != row and squares[other] > 0 and rest.without(((kind, other),)).all_fit(level):
-                found.append((kind, other))
-    return found
+                as_well.append((kind, other))
+    return as_well
 
 
 def is_scale(left: Left, kind: int, out: tuple[tuple[int, int], ...]) -> bool:
@@ -182,21 +182,21 @@ def is_scale(left: Left, kind: int, out: tuple[tuple[int, int], ...]) -> bool:
 
     By Schwarz's criterion, with the redundancy f for the number of data: minus twice the logarithm of the likelihood,
     and `log f` for each parameter, a factor of all deviations, or the numbers of rows and which ones they are."""
-    own = tuple(row for row in out if row[0] == kind)
+    wrong = tuple(row for row in out if row[0] == kind)
     others = tuple(row for row in out if row[0] != kind)
     base = left.without(others) if others else left
     squares, redundancy, _ = base.misfit(kind)
-    kept, _, _ = base.without(own).misfit(kind)
+    kept, _, _ = base.without(wrong).misfit(kind)
     size = left.kinds[kind].shape[1]
     several = np.log(max(redundancy, 2.0))
-    by_errors = kept + len(own) * (size * several + 2 * np.log(len(left.kinds[kind])))
+    by_errors = kept + len(wrong) * (size * several + 2 * np.log(len(left.kinds[kind])))
     by_factor = redundancy * (np.log(max(squares / redundancy, 1.0)) + 1) + several
     return bool(by_factor < by_errors)
 
 
 def _predicted(left: Left, out: tuple[tuple[int, int], ...], row: tuple[int, int]) -> float:
     """T of a row that is left out, among the others that are not."""
-    others = tuple(one for one in out if one != row)
+    others = tuple(other for other in out if other != row)
     return (left.without(others) if others else left).error(row)[1]
 
 

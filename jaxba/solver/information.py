@@ -79,9 +79,9 @@ def system_of(
     by_point = columns(linear.point_jacobian) * free_points[point][:, None, None]
 
     def squares(rows: np.ndarray) -> np.ndarray:
-        found = np.zeros((points, 3, 3))
-        np.add.at(found, point, np.einsum("nki,nkj->nij", rows, rows))
-        return found
+        sums = np.zeros((points, 3, 3))
+        np.add.at(sums, point, np.einsum("nki,nkj->nij", rows, rows))
+        return sums
 
     # squares know a weak direction badly, columns that are turned to it do not
     _, turn = np.linalg.eigh(squares(by_point))
@@ -121,8 +121,8 @@ def inverse_of(system: System) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarr
         return whole, whole
     cross = (system.jacobian.T @ system.by_point).tocsr()
     eliminated = point_blocks(system) @ cross.T
-    own = np.sqrt(np.diagonal(whole))
-    scale = 1 / np.where(own > 0, own, 1.0)
+    roots = np.sqrt(np.diagonal(whole))
+    scale = 1 / np.where(roots > 0, roots, 1.0)
     values, vectors = np.linalg.eigh((whole - (cross @ eliminated).toarray()) * scale[:, None] * scale)
     weak = values < WEAK
     strong = vectors[:, ~weak]

@@ -159,15 +159,15 @@ def _scaled(left: Left, out: RowsOfKinds) -> bool:
 
 def _kinds(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -> list[Kind]:
     """Everything that was measured to standard deviations."""
-    found = []
+    kinds = []
     for rows, residual in zip(problem.residuals.rows, residuals_of_rows(problem), strict=True):
         of_rows = functools.partial(_row_name, problem, rows), functools.partial(_off, rows)
-        found.append(Kind(rows.residual.name, residual, *of_rows, _unknowns_of(problem, rows)))
+        kinds.append(Kind(rows.residual.name, residual, *of_rows, _unknowns_of(problem, rows)))
     if clicked.any():
         marks = problem.subset(clicked)
         of_pixels = functools.partial(_pixel_name, marks), functools.partial(_pixels_off, marks)
-        found.append(Kind(MARKS, geometry.residuals(marks), *of_pixels))
-    return found
+        kinds.append(Kind(MARKS, geometry.residuals(marks), *of_pixels))
+    return kinds
 
 
 def _unknowns_of(problem: BundleProblem, rows: Rows) -> int:
@@ -186,14 +186,14 @@ def _unknowns_of(problem: BundleProblem, rows: Rows) -> int:
 def _of_rows(linear: Linear, out: RowsOfKinds, kind: int, kinds: list[Kind]) -> str:
     """That rows of a kind do not fit the rest, by how much, and which others might be wrong in their place."""
     left = linear.left
-    own = [row for row in out if row[0] == kind]
+    rows = [row for row in out if row[0] == kind]
     errors = {}
-    for row in own:
-        others = tuple(one for one in out if one != row)
+    for row in rows:
+        others = tuple(other for other in out if other != row)
         errors[row] = (left.without(others) if others else left).error(row)
-    own.sort(key=lambda row: -errors[row][1])
+    rows.sort(key=lambda row: -errors[row][1])
     texts = []
-    for row in own[:NAMED]:
+    for row in rows[:NAMED]:
         off, square = errors[row]
         name = kinds[kind].row_name(row[1])
         far = kinds[kind].off(row[1], off / linear.factors[kind][row[1]])
@@ -202,7 +202,7 @@ def _of_rows(linear: Linear, out: RowsOfKinds, kind: int, kinds: list[Kind]) -> 
         if perhaps:
             names = [_name(kinds, other) for other in perhaps]
             texts[-1] += f", unless {_listed(names, 'or')} is wrong instead"
-    return f"{kinds[kind].name}: does not fit the rest: {_listed(texts, 'and', len(own))}"
+    return f"{kinds[kind].name}: does not fit the rest: {_listed(texts, 'and', len(rows))}"
 
 
 def _of_whole_kind(left: Left, kind: int, of: Kind) -> str:
@@ -250,10 +250,10 @@ def _row_name(problem: BundleProblem, rows: Rows, row: int) -> str:
     pairs = zip(rows.residual.unknowns, rows.index, strict=True)
     parts = [(name.removesuffix(SECOND), index[row]) for name, index in pairs]
     names = dict.fromkeys(part_name(problem.labels, PARTS[name], at) for name, at in parts if name in PARTS)
-    owned = " and ".join(names)
-    if rows.residual.function.__module__.startswith("jaxba.") and owned:
-        return owned
-    return f"row {row} ({owned})" if owned else f"row {row}"
+    listed = " and ".join(names)
+    if rows.residual.function.__module__.startswith("jaxba.") and listed:
+        return listed
+    return f"row {row} ({listed})" if listed else f"row {row}"
 
 
 def _off(rows: Rows, row: int, whitened: Float[np.ndarray, " size"]) -> str:

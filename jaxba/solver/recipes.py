@@ -6,6 +6,7 @@ one that adds most to those before it."""
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
@@ -26,14 +27,29 @@ def solve_recipes(
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
 ) -> list[Solution]:
-    """Solves a problem with a policy, and with the next ones of `RECIPES`, `count` in all, on as many cores. Returns
-    all solutions; `min(found, key=lambda one: one.final_cost)` is the best. Each compiles a program of its own. A limit
-    of time (`Tolerances.seconds`) is that of all together. Raises as `solve`; ValueError: there are not so many
-    recipes."""
-    check_count("count", count, 1)
-    if count > len(RECIPES):
+    """Solves a problem with several policies, on as many cores. Each compiles a program of its own.
+
+    Args:
+        problem: the start of all solves.
+        count: number of policies, from 1 to that of `RECIPES`.
+        policy: the first policy; the others are the next ones of `RECIPES`, which bring their own refinement and
+            coordinates.
+        options: as for `solve`. A limit of time (`Tolerances.seconds`) is that of all solves together.
+
+    Returns:
+        All solutions; `min(solutions, key=lambda solution: solution.final_cost)` is the best.
+
+    Raises: as `solve`; ValueError: there are not so many recipes."""
+    check_count("count", count, 0)
+    if not 1 <= count <= len(RECIPES):
         raise ValueError(f"there are 1 to {len(RECIPES)} recipes, not {count}")
     options = checked_options(options)
     limit = TimeLimit(options)
+    others = replace(options, refinement=None, coordinates=None)
+    recipes = [(policy, options), *((name, others) for name in RECIPES[1:count])]
+
+    def solved(recipe: tuple[str | DampingPolicy, SolveOptions]) -> Solution:
+        return solve(problem, recipe[0], limit.rest(recipe[1]))
+
     with ThreadPoolExecutor(process.threads()) as pool:
-        return list(pool.map(lambda one: solve(problem, one, limit.rest(options)), (policy, *RECIPES[1:count])))
+        return list(pool.map(solved, recipes))

@@ -88,14 +88,18 @@ def left_of(
     combined = [_rows_among(place[np.asarray(x.observation)], x.size) for x in here.residuals.rows]
     combined.append(_rows_among(place[np.flatnonzero(clicked)][:, None, None], 2))
     numbers = sum(kind.shape[0] * kind.shape[1] for kind, _ in combined)
-    entries, columns, factors, kinds, start = [], [], [], [], 0
+    entries = []
+    columns = []
+    factors = []
+    kinds = []
+    start = 0
     for at, factor in combined:  # (rows, size, ends)
-        own = start + np.arange(at.shape[0] * at.shape[1]).reshape(at.shape[:2])
-        entries.append(np.repeat(own.ravel(), at.shape[2]))
+        place_of_number = start + np.arange(at.shape[0] * at.shape[1]).reshape(at.shape[:2])
+        entries.append(np.repeat(place_of_number.ravel(), at.shape[2]))
         columns.append(at.ravel())
         factors.append(np.full(at.size, factor))
-        kinds.append(own)
-        start += own.size
+        kinds.append(place_of_number)
+        start += place_of_number.size
     shape = numbers, len(system.residual)
     chosen = csr_matrix((np.concatenate(factors), (np.concatenate(entries), np.concatenate(columns))), shape)
     by_camera, by_point = chosen @ system.jacobian, chosen @ system.by_point
@@ -123,8 +127,8 @@ def noise_of(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"])
     if spare <= 0:
         return Noise(1.0, 1.0)
     lost = NORMAL * np.sqrt(2 * np.sum(~clicked) / spare)
-    found = geometry.residuals(problem), problem.observations - geometry.project(problem)
-    return Noise(*(max(LEAST_PIXELS, lost * float(np.median(np.abs(one[~clicked])))) for one in found))
+    left = geometry.residuals(problem)[~clicked], (problem.observations - geometry.project(problem))[~clicked]
+    return Noise(*(max(LEAST_PIXELS, lost * float(np.median(np.abs(residual)))) for residual in left))
 
 
 def noise_left(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -> Noise:

@@ -109,6 +109,7 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert printed.err == ""
 
 
+@pytest.mark.slow
 def test_a_search_for_points_is_reported_and_rows_are_numbered_consecutively(tmp_path, capsys):
     """One point behind its cameras, with which the solve alone converges far above the minimum."""
     problem, log = solve(support.tiny()).problem, tmp_path / "log.json"
@@ -530,6 +531,7 @@ def test_reject_is_for_all_observations(tmp_path, capsys):
     assert capsys.readouterr().err == "error: --reject is for all observations, not for a part\n"
 
 
+@pytest.mark.slow
 def test_reject_notes_wrong_matches_by_image_and_leaves_them_out_of_the_model(tmp_path, capsys):
     scene = random_scene(SceneConfig(cameras=12, points=400, mean_track=6.0, trajectory="orbit"), 1)
     wrong = np.random.default_rng(0).random(scene.num_observations) < 0.2

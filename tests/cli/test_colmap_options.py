@@ -197,7 +197,7 @@ def test_a_name_goes_before_an_id_and_another_form_of_a_number_is_no_id(model, t
             constrained(problem, (), None, str(tmp_path / "c.yaml"))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("another file has a sample of it")
 def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
     from jaxba.problem import geometry
 

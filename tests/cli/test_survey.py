@@ -262,6 +262,7 @@ def test_a_coordinate_system_of_the_scene_counts_for_positions_without_one_or_is
     ]
 
 
+@pytest.mark.slow
 def test_the_written_model_stays_in_metres(scene, tmp_path, capsys):
     folder, problem, places = scene
     write_log(tmp_path / "log.csv", problem, places)
@@ -272,6 +273,7 @@ def test_the_written_model_stays_in_metres(scene, tmp_path, capsys):
     np.testing.assert_allclose(distances(centers), distances(10 * geometry.camera_centers(problem.cameras)), atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_position_that_does_not_fit_is_named_and_strict_ends_with_a_status(scene, tmp_path, capsys):
     """The solution is written, and the log has the note."""
     folder, problem, places = scene

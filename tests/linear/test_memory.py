@@ -28,7 +28,8 @@ def bytes_per_observation(problem, options, dtype):
     return total / problem.num_observations
 
 
-@pytest.mark.parametrize(("dtype", "refine"), [(jnp.float64, 3), pytest.param(jnp.float32, 0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("dtype", "refine"), [(jnp.float64, 3), (jnp.float32, 0)])
 def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, refine):
     problem = random_scene(scene_like("random-150"), 0)
     used = bytes_per_observation(

@@ -218,6 +218,7 @@ def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
     assert solution.final_cost <= reference.final_cost * (1 + 1e-2)
 
 
+@pytest.mark.slow
 def test_a_method_chosen_by_name_is_the_one_made_of_its_options():
     problem = support.tiny()
     by_name = solve(problem, "classic", method="deeplm")

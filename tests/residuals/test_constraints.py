@@ -59,6 +59,7 @@ def test_control_points_are_rows_of_points_by_id(said):
         said(text, strict=True)
 
 
+@pytest.mark.slow
 def test_a_scale_bar_scales_a_scene_that_has_no_scale(said):
     item = "points: [100, 101], stddev: 0.001, length: 3"
     found = said(f"distances:\n- {{{item}}}\n- {{points: [100, 129], stddev: 0.001, length: 4}}\n")

@@ -47,7 +47,7 @@ def held_graph() -> jaxba.BundleProblem:
     return jaxba.hold(jaxba.with_residual(as_problem(poses), rows), poses=[0])
 
 
-@pytest.mark.slow
+@pytest.mark.slow("another file has a sample of it")
 def test_a_pose_graph_has_covariances():
     assert np.isfinite(jaxba.covariance(held_graph()).poses).all()
 

@@ -164,7 +164,7 @@ def everything() -> jaxba.BundleProblem:
     return jaxba.with_residual(problem, apart(point=[0, 4], point_2=[9, 5], by=by, sigma=0.1))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("another file has a sample of it")
 def test_a_moved_scene_has_the_same_residuals_and_the_same_end():
     problem = everything()
     options = jaxba.SolveOptions(max_iterations=60)
@@ -177,6 +177,7 @@ def test_a_moved_scene_has_the_same_residuals_and_the_same_end():
     assert here.final_cost == pytest.approx(there.final_cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_rows_of_a_point_that_goes_go_and_the_others_stay():
     problem = everything()
     kept = problem.subset(problem.point_index != 4, points=np.delete(np.arange(POINTS), 4))

@@ -155,6 +155,7 @@ def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
     assert jaxba.solve(one_diverged(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
 
 
+@pytest.mark.slow
 def test_turns_end_lower_than_the_solve_alone_and_count_through():
     heard, searches = [], []
     alone = jaxba.solve(one_diverged(), "ceres", STRANDING)

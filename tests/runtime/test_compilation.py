@@ -128,6 +128,7 @@ def test_candidates_one_by_one_are_those_of_the_loop(level):
     assert {accepted for accepted, _ in seen} == {repaired for _, repaired in seen} == {True, False}
 
 
+@pytest.mark.slow
 @pytest.mark.xla
 def test_camera_rounds_are_compiled_where_a_step_has_some():
     jax.clear_caches()
@@ -244,6 +245,7 @@ def test_an_unknown_choice_is_refused_in_one_line(unchecked):
         solve(support.tiny(), compilation="fast")
 
 
+@pytest.mark.slow
 @on_a_cpu
 def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkeypatch):
     path = tmp_path / "tiny.txt"

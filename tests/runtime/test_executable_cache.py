@@ -157,6 +157,7 @@ def test_nothing_that_is_read_can_run_code_of_its_own(folder, monkeypatch):
         assert executable_cache.ExecutableCache(folder).load(file) is None
 
 
+@pytest.mark.slow
 def test_a_problem_that_shares_some_programs_compiles_each_other_one_once(folder):
     once = lambda problem: solve(problem, "ceres", max_iterations=2, callback=lambda record: None)
     once(support.tiny())
@@ -294,6 +295,7 @@ def test_programs_with_code_of_other_packages_are_not_stored(function, static, a
     assert executable_cache.ExecutableCache(folder).path_for(function, static, (argument,)) is None
 
 
+@pytest.mark.slow
 def test_a_users_residual_is_known_by_what_it_does(folder):
     def registered(scale: float) -> jaxba.BundleProblem:
         @jaxba.residual

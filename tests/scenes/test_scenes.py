@@ -256,7 +256,7 @@ def test_each_knob_of_the_start_moves_it_further_away(knob):
     assert costs[0] < costs[1] < costs[2]
 
 
-@pytest.mark.parametrize("name", [*SMALL_NAMES, "dubrovnik-356"])
+@pytest.mark.parametrize("name", [*SMALL_NAMES, pytest.param("dubrovnik-356", marks=pytest.mark.slow)])
 def test_the_start_is_as_far_as_bal_starts_are(name):
     start, truth = random_scene_with_truth(scene_like(name), 0)
     assert 10 < cost(start) / cost(truth) < 200

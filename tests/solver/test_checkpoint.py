@@ -150,6 +150,7 @@ def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance
         solve(problem, "ceres", other, checkpoint=file)
 
 
+@pytest.mark.slow
 def test_functions_and_losses_of_residuals_belong_to_a_checkpoint(tmp_path):
     problem, file, rows = support.tiny(), tmp_path / "solve.npz", scaled(size=0, pose=[0, 1], measured=0.5)
     options = SolveOptions(max_iterations=1)

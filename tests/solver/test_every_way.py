@@ -72,7 +72,7 @@ def assert_as_alone(problems: list[BundleProblem], policy: str) -> None:
         assert found.capacity.fixed
 
 
-@pytest.mark.slow
+@pytest.mark.slow("another file has a sample of it")
 def test_rows_and_constants_of_each_of_many_problems_are_its_own(small):
     problems = problems_of(["distance", "baseline"], 4)
     assert_as_alone([jaxba.hold(problem, poses=[0]) for problem in problems], "ceres")

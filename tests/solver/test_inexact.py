@@ -29,6 +29,7 @@ def check(kind: int, seed: int, inexact: tuple[str, ...]) -> None:
                 assert found.iterations <= 2 * exact.iterations + 5
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_end_where_a_factorisation_does():
     """Two sensors, the place of one free, and priors of positions."""
     check(25, 0, ("implicit",))

@@ -143,6 +143,7 @@ def test_a_program_that_fails_ends_nothing_but_its_problems(small, monkeypatch):
     assert sum(str(one) == "out of memory" for one in others) >= many.SEEN
 
 
+@pytest.mark.slow
 def test_other_linear_solvers_solve_one_by_one(small):
     problems, options = mixed(2), SolveOptions(linear_solver="implicit", max_iterations=4, compilation="quick")
     found = list(solve_many(problems, "ceres", options))

@@ -196,6 +196,7 @@ def test_one_wrong_control_point_with_a_robust_loss_moves_no_scene(truth):
     assert jnp.median(away) < 0.1
 
 
+@pytest.mark.slow
 def test_many_problems_start_as_one_does(truth):
     start = jaxba.with_residual(somewhere(truth, 50.0), bars(truth))
     options = jaxba.SolveOptions(max_iterations=3)

@@ -35,7 +35,7 @@ def env():
         return jaxba.make_env("paper", *SMALL, reward=mine)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("another file has a sample of it")
 def test_two_lines_train_a_policy_and_the_same_lines_the_same_one(env):
     policy, again = (jaxba.train(env, steps=40, seeds=2) for _ in range(2))
     for one, other in zip(policy.layers, again.layers, strict=True):

@@ -143,6 +143,7 @@ def test_the_toy_tells_a_wrong_last_observation_and_a_wrong_terminal_apart(sign:
         np.testing.assert_allclose(opinions("twin", toy, sign), sign / (1 - GAMMA / 2), atol=0.6)
 
 
+@pytest.mark.slow
 def test_the_entropy_reaches_what_is_wanted() -> None:
     state, entropy = start(LEARNS, SHORT, toys.ACTION, jax.random.key(0)), []
     for _ in range(150):
