@@ -43,6 +43,8 @@ def bordered(
     whole = lax.map(columns_of, members.T)  # [lenses, numbers, cameras, width]
     whole = whole.reshape(-1, *like.shape).transpose(1, 2, 0)
     corner = jnp.einsum("cl,ckm->lkm", members, whole[:, POSE_SIZE:], precision="highest").reshape(-1, whole.shape[2])
+    absent = jnp.repeat(jnp.asarray(lenses.owners) >= lenses.distinct, numbers)  # room for more shared lenses
+    corner += jnp.diag(absent.astype(corner.dtype))
 
     def kept(x: Array) -> Array:
         if unknowns.all_shared:
@@ -57,11 +59,12 @@ def bordered(
         found = inner(jnp.concatenate([kept(right)[:, :, None], *([] if store else [columns])], axis=2))
         own, solved = found[:, :, 0], jnp.concatenate([found[:, :, 1:], *stored], axis=2)
         times = lambda x: jnp.einsum("cam,ca...->m...", columns, x, precision="highest")
-        rest = lenses.total(right[:, POSE_SIZE:])[lenses.owners].reshape(-1) - times(own)
+        sums = lenses.total(right[:, POSE_SIZE:])
+        rest = sums.at[lenses.owners].get(mode="fill", fill_value=0).reshape(-1) - times(own)
         lens = factor_and_solve(corner - times(solved), rest)
         x = own - jnp.einsum("cam,m->ca", solved, lens, precision="highest")
         others = jnp.zeros((len(x), numbers), x.dtype) if unknowns.all_shared else x[:, POSE_SIZE:]
-        values = lenses.total(others).at[lenses.owners].set(lens.reshape(-1, numbers))
+        values = lenses.total(others).at[lenses.owners].set(lens.reshape(-1, numbers), mode="drop")
         return jnp.concatenate([x[:, :POSE_SIZE], lenses.copied(values)], axis=1)
 
     return solve

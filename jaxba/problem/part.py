@@ -15,8 +15,8 @@ from jaxba.problem.options import check_count
 from jaxba.problem.preprocess import observed
 
 FEW = 0.5
-"""Share of observed cameras below which a problem is solved without the others: their rows in the reduced camera system
-cost more than the copies."""
+"""Share of observed cameras, or points, below which a problem is solved without the others: their rows in the reduced
+camera system, and their places in the arrays, cost more than the copies."""
 
 
 def part(
@@ -81,13 +81,13 @@ class Observed(NamedTuple):
 
 
 def observed_part(problem: BundleProblem) -> Observed:
-    """The observed part of a problem, if that are few of its cameras; all of it otherwise, and with rigs and residuals,
-    which say more of cameras than pixels do."""
+    """The observed part of a problem, if that is few of its cameras or points; all of it otherwise, and with rigs and
+    residuals, which say more of cameras than pixels do."""
     every = Observed(problem, *(np.arange(count) for count in (problem.num_cameras, problem.num_points)))
     if problem.rigs is not None or problem.residuals:
         return every
     cameras, points = map(np.flatnonzero, observed(problem))
-    if len(cameras) >= FEW * problem.num_cameras:
+    if len(cameras) >= FEW * problem.num_cameras and len(points) >= FEW * problem.num_points:
         return every
     labels = None if problem.labels is None else problem.labels.of(cameras, points)
     found = problem.subset(np.ones(problem.num_observations, bool), cameras, points)

@@ -90,8 +90,8 @@ class SolveOptions:
     """Whether array sizes are rounded up to a grid, so that problems of about the same size share one compiled program,
     also in a persistent compilation cache. Results differ by rounding only, iterations take up to 1.4 times as long.
     None: for at most 64 cameras and 60,000 observations, unless compilation is `full`. Padding is for the explicit
-    solver, which `auto` then means; with other solvers, with lenses and for larger problems nothing is padded, and
-    `Solution.capacity` is None."""
+    solver, which `auto` then means; with other solvers, with rigs or other residuals, and for larger problems nothing
+    is padded, and `Solution.capacity` is None."""
 
     compilation: Compilation = "auto"
     """Optimisation level of compilation. `full`: fully optimised; for many solves of one shape, and for timing of

@@ -155,7 +155,14 @@ def build_layout(
     by_camera = sorted_by(camera, cameras)
     levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, agreement.within("cameras"))
     camera_levels = with_spare_row(levels, empty)
-    unknowns = unknowns_of(problem, is_seen, slots.points, fixed=options.intrinsics == "fixed", agreement=agreement)
+    unknowns = unknowns_of(
+        problem,
+        is_seen,
+        slots.points,
+        fixed=options.intrinsics == "fixed",
+        agreement=agreement,
+        capacity=capacity,
+    )
     pair_lists = slot_grid = drawn_partitions = camera_clusters = None
     dense = pairs and factor and grid and is_dense(observations, cameras, len(slots.points))
     if agreement.size("listed pairs", int(not dense)) == 0:  # in all shards or none

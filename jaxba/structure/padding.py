@@ -2,9 +2,9 @@
 
 A compiled program fits one set of array shapes. Without padding these follow from the data (buckets by track length,
 summation trees, pairs), so that every problem compiles its own program, which takes seconds where the solve may take a
-fraction of one. With padding all shapes follow from a `Capacity`, four numbers on a grid, but for few problems with
-unusually long tracks or many small blocks (`sum_trees.prefix_levels`). Padding contains no observations: it adds exact
-zeros to sums, and its cameras and points never change.
+fraction of one. With padding all shapes follow from a `Capacity`, five numbers on a grid, but for few problems with
+unusually long tracks or many small blocks (`sum_trees.prefix_levels`). Which cameras share a lens and what is constant
+is data. Padding contains no observations: it adds exact zeros to sums, and its cameras and points never change.
 
 A tenth to a quarter of the slots are padding: up to a ninth from rounding, the others in half-filled chunks of slots.
 Larger problems are not padded (`capacity_of`), since their iterations take as long as compiling does. A problem with
@@ -23,6 +23,7 @@ from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
 CAMERAS = (8, 12, 16, 20, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128)  # longer sequences are better factored as bands
+LENSES = (0, 1, 4, 16, 64)  # of shared lenses; each takes as many products with the system as it has free numbers
 POINT_CHUNK = 2  # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
 MIN_OBSERVATIONS = 1024  # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
 POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)  # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
@@ -40,6 +41,7 @@ class Capacity:
     points: int
     observations: int  # number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty
     pairs: int  # number of pairs of observations of one point, an observation with itself included
+    lenses: int = 0  # number of lenses that several cameras share
     # whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a point
     # twice. Else they are smaller where the problem is a usual one.
     fixed: bool = False
@@ -61,20 +63,19 @@ class Capacity:
 def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
     """The capacity of a problem: its sizes rounded up to the grid.
 
-    Cameras are rounded up to `CAMERAS`, slots to eight sizes an octave. Points and pairs get a fixed multiple of the
-    slots, or the next larger one if that is not enough: rounding each on its own would give more programs.
-    `observations` are the sorted ones of the problem, if they are known already. Returns None for problems with lenses
-    (problem/intrinsics.py), constants, rigs or other residuals than those of pixels, with more than `MAX_CAMERAS` or
-    `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`."""
-    general = problem.lenses is not None or problem.constants is not None
-    general = general or problem.rigs is not None or bool(problem.residuals)
+    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to eight sizes an octave. Points and pairs get
+    a fixed multiple of the slots, or the next larger one if that is not enough: rounding each on its own would give
+    more programs. `observations` are the sorted ones of the problem, if they are known already. Returns None for
+    problems with rigs or other residuals than those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS` or than the
+    last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
     observations = observations or ObservationOrder.of(problem)
     cameras, points = observations.num_cameras, len(observations.tracks)
-    if general or cameras > MAX_CAMERAS:
+    if problem.rigs is not None or problem.residuals or cameras > MAX_CAMERAS:
         return None
     needed = slots_for(observations.tracks)
     pairs = observations.num_listed_pairs
-    if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
+    shared_lenses = _num_shared_lenses(problem, observations)
+    if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS or shared_lenses > LENSES[-1]:
         return None
     wanted = max(MIN_OBSERVATIONS, needed)
     step = _power(wanted) // 16  # slots are 8, 9, ..., 15 times a power of two
@@ -85,7 +86,18 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
         points=next(room for share in POINTS_PER_CHUNK if (room := int(share * chunks)) >= points),
         observations=slots,
         pairs=slots * PAIRS_PER_SLOT * _power(-(-pairs // (slots * PAIRS_PER_SLOT))),
+        lenses=next(room for room in LENSES if room >= shared_lenses),
     )
+
+
+def _num_shared_lenses(problem: BundleProblem, observations: ObservationOrder) -> int:
+    """Number of lenses that several observed cameras share."""
+    if problem.lenses is None:
+        return 0
+    lens_of_camera = np.asarray(problem.lenses.index)
+    observed_cameras = np.unique(observations.camera)
+    cameras_of_lens = np.bincount(lens_of_camera[observed_cameras])
+    return int(np.count_nonzero(cameras_of_lens > 1))
 
 
 def slots_for(tracks: Int[np.ndarray, " points"]) -> int:

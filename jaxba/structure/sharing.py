@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +25,18 @@ class Sharing(ArrayRecord):
 
     @classmethod
     def of(cls, names: Int[np.ndarray, " items"]) -> Sharing:
-        """Items of equal names are one unknown; unknowns are in the order of their first items."""
-        _, first, own, times = np.unique(names, return_index=True, return_inverse=True, return_counts=True)
+        """Items of equal names are one unknown; unknowns are in the order of their first items. Items with negative
+        names are not computed with, and own nothing."""
+        unique, first, own, times = np.unique(names, return_index=True, return_inverse=True, return_counts=True)
         rank = np.argsort(np.argsort(first)).astype(np.int32)
-        return cls(rank[own], np.sort(rank[times > 1]), len(first), len(first) < len(names))
+        owners = np.sort(rank[(times > 1) & (unique >= 0)])
+        return cls(rank[own], owners, len(first), len(first) < len(names))
+
+    def with_room(self, owners: int, distinct: int) -> Sharing:
+        """The same items, with room for more unknowns and owners, which have no items. Owners that are not there are
+        out of range."""
+        missing = np.full(owners - len(self.owners), distinct, np.int32)
+        return replace(self, owners=np.append(self.owners, missing), distinct=distinct)
 
     @property
     def members(self) -> Bool[AnyArray, "items owners"]:
@@ -65,11 +73,14 @@ class Sharing(ArrayRecord):
         return self.shares(self.sums(rows))
 
     def merged(self, lower: Float[Array, "items items"]) -> Float[Array, "distinct distinct"]:
-        """`T^T M T` of a symmetric M of which only the lower triangle is read."""
+        """`T^T M T` of a symmetric M of which only the lower triangle is read. Unknowns without items have a unit
+        row."""
         if not self.several:
             return lower
         matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
-        return self.total(self.total(matrix).T)
+        merged = self.total(self.total(matrix).T)
+        items = self.total(jnp.ones(len(lower), lower.dtype))
+        return merged + jnp.diag(jnp.where(items > 0, 0, 1).astype(lower.dtype))
 
     @staticmethod
     def joined(*parts: tuple[Sharing, int]) -> Sharing:

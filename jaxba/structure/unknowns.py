@@ -32,8 +32,11 @@ from jaxba.problem.options import Intrinsics
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.problem.row_owners import block_groups
 from jaxba.structure.agreement import Agreement
+from jaxba.structure.padding import Capacity
 from jaxba.structure.sharing import Mask, Sharing
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
+
+NO_LENS = -1  # name of the lens of cameras without observations, in a padded layout
 
 
 @register_pytree
@@ -144,17 +147,20 @@ def unknowns_of(
     *,
     fixed: bool,
     agreement: Agreement,
+    capacity: Capacity | None = None,
 ) -> Unknowns:
     """The unknowns of a problem, for its layout. The problem is `in_frames` if it has rigs. `seen`: whether each camera
     has an observation; padding cameras have none. `order`: point of the problem at each position in layout order; out
     of range for padding. `fixed`: whether all intrinsics are constant. Some points of other shards may be constant
-    (`agreement`)."""
+    (`agreement`). `capacity`: of a padded layout, whose shapes do not depend on what is constant and shared."""
     cameras, points = len(problem.cameras), len(problem.points)
     lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
     padding, index = len(seen) - cameras, np.asarray(lenses.index)
     poses_free = free_poses(problem)
     own_sizes = problem.residuals.sizes
     own_free = np.ones((cameras, sum(own_sizes)), bool)
+    general = problem.lenses is not None or problem.constants is not None
+    may_hold = capacity is not None and general  # something is constant in some problem of this shape
     lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:], own_free])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
     free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
@@ -163,17 +169,23 @@ def unknowns_of(
     any_held = agreement.size("constant points", int(held.any()))
     apart = -1 - np.arange(len(seen))  # names of cameras that have nothing in common
     padded = lambda names: np.where(seen, np.pad(names, (0, padding)), apart)
-    shares = Sharing.of(padded(index))
+    lens_room = 0 if capacity is None else capacity.lenses
+    lens_names = padded(index) if not lens_room else np.where(seen, np.pad(index, (0, padding)), NO_LENS)
+    shares = Sharing.of(lens_names)
+    all_shared = bool(np.isin(shares.index, shares.owners)[seen].all())
+    if lens_room:
+        not_shared = 0 if all_shared else len(seen)
+        shares = shares.with_room(lens_room, lens_room + not_shared + 1)  # and the one of `NO_LENS`
     model = np.zeros(cameras, np.int32) if lenses.model is None else np.asarray(lenses.model)[index]
     return Unknowns(
         poses=Sharing.of(apart if problem.rigs is None else padded(_frames(problem))),
         lenses=shares if len(columns) > sum(own_sizes) else Sharing.of(apart),
         own=tuple(Sharing.of(padded(group)) for group in block_groups(problem)),
-        free=Mask.of(free.T),
-        free_points=Mask(np.append(~held, True)[np.minimum(order, points)], not any_held),
+        free=Mask(free.T, bool(free.all()) and not may_hold),
+        free_points=Mask(np.append(~held, True)[np.minimum(order, points)], not (any_held or may_hold)),
         model=np.pad(model, (0, padding)),
         models=lenses.models,
-        all_shared=bool(np.isin(shares.index, shares.owners)[seen].all()),
+        all_shared=all_shared,
         columns=columns,
         lens_size=lens_size(lenses),
         own_sizes=own_sizes,

@@ -22,7 +22,19 @@ from test_layout import (
     sum_by_ranks,
 )
 
-from jaxba import Ceres, Loss, SolveOptions, StepOptions, Tolerances, build_layout, prepare, random_scene, solve_loop
+from jaxba import (
+    Ceres,
+    Lenses,
+    Loss,
+    SolveOptions,
+    StepOptions,
+    Tolerances,
+    build_layout,
+    hold,
+    prepare,
+    random_scene,
+    solve_loop,
+)
 from jaxba.lm.step import state_of
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem.options import Refinement
@@ -445,3 +457,35 @@ def test_a_large_problem_is_solved_as_it_is():
     padded, plain = (prepare(many, "ceres", SolveOptions(pad=pad)) for pad in (True, False))
     assert padded.capacity is None
     assert padded.state.cost == plain.state.cost
+
+
+# Lenses and constants
+
+
+def with_lenses(problem, lenses: int, seed: int):
+    """The problem with so many lenses for all of its cameras, some numbers of them held, and some poses and points."""
+    random = np.random.default_rng(seed)
+    lens_of_camera = np.arange(problem.num_cameras) % lenses
+    cameras = np.array(problem.cameras)
+    cameras[:, 6:] = cameras[lens_of_camera, 6:]
+    free = np.ones((lenses, 3), bool)
+    free[random.integers(lenses), 2] = False
+    shared = problem.replace(cameras=cameras, lenses=Lenses(lens_of_camera, free))
+    return hold(shared, poses=[int(random.integers(problem.num_cameras))], points=[0, 3])
+
+
+@pytest.mark.parametrize("lenses", [1, 3, pytest.param(6, marks=pytest.mark.slow)])
+def test_a_padded_solve_with_shared_lenses_and_constants_equals_the_one_of_the_given_sizes(lenses):
+    problem = with_lenses(support.tiny(), lenses, seed=lenses)
+    check_same(stepwise(problem, max_iterations=5, pad=True), stepwise(problem, max_iterations=5))
+
+
+def test_what_is_shared_and_constant_changes_no_shape():
+    """Other images of a lens, other lenses of less than a quarter of them, other constants and other sizes."""
+    one, other = mates(dense=False)
+    made = []
+    for seed, (problem, lenses) in enumerate([(one, 2), (other, 2), (one, 3), (other, 4)]):
+        problem = with_lenses(problem, lenses, seed)
+        capacity = capacity_of(problem)
+        made.append((capacity, shapes(build_layout(problem, capacity=capacity))))
+    assert all(each == made[0] for each in made)
