@@ -148,10 +148,10 @@ def implicit_work(observed: int, products: float = ASSUMED_PRODUCTS) -> Work:
 
 def count_pairs(observations: ObservationOrder) -> PairCounts:
     """Counts pairs and blocks. Blocks and bandwidth are upper bounds for more than `MAX_COUNTED_PAIRS` pairs."""
-    pairs, cameras, tracks = observations.num_pairs, observations.num_cameras, observations.tracks
+    pairs, cameras, tracks = observations.num_pairs, observations.num_cameras, observations.moving_tracks
     if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
         return _most_pairs(observations)
-    camera, start = observations.camera, observations.start[:-1]
+    camera, start = observations.camera[observations.moves], np.cumsum(tracks) - tracks
     shared = np.zeros((cameras, cameras), bool)
     for length in np.unique(tracks[tracks > 0]):
         first = start[tracks == length][:, None]

@@ -63,12 +63,11 @@ def cluster_layout(
     first = np.flatnonzero(np.diff(keys, prepend=-1))
     keys, counts = keys[first], np.diff(first, append=len(keys))
     seen_by = np.bincount(keys // clusters, minlength=points)
-    start = np.cumsum(seen_by) - seen_by
     coarse, count = np.arange(len(keys)), agreement.size("coarse", len(keys))
     width = agreement.size("width", fitting_width(counts))
     counts = np.append(counts, np.zeros(count + 1 - len(keys), counts.dtype))
     first_slots = np.append(slots.slot[order][first], np.full(count + 1 - len(keys), slots.empty))
-    keyed = (keys % clusters, coarse, seen_by, start, clusters, count)
+    keyed = (keys % clusters, coarse, seen_by, clusters, count)
     return ClusterLayout(
         label=label.astype(np.int32),
         members=cluster_members(label, clusters, int(np.bincount(label).max())),

@@ -51,7 +51,6 @@ def pair_layout(
     camera: np.ndarray,
     row_index: np.ndarray,
     tracks: np.ndarray,
-    start: np.ndarray,
     cameras: int,
     empty: int,
     *,
@@ -63,12 +62,13 @@ def pair_layout(
     """Lists all pairs of observations of one point, sorted by the block that they add to.
 
     Observations are sorted by point; each has its `camera` and its row among those that are multiplied (its
-    camera-sorted index). Of each point there are the number of observations (`tracks`) and the position of the first.
+    camera-sorted index). `tracks` are the numbers of observations of each point. Observations by cameras that are
+    constant add nothing and need not be among them.
     `empty` is the index of a row of zeros. `factor`: whether the system will be factored; `banded`: whether as a band,
     where that is cheaper. With a `capacity` all shapes follow from that: every block of the lower triangle is listed,
     and no band is used. The other shards of a problem (`agreement`) have the same blocks."""
     camera, row_index = camera.astype(np.int32), row_index.astype(np.int32)
-    left, right = _pairs_of_tracks(tracks, start)
+    left, right = _pairs_of_tracks(tracks)
     rows, columns = camera[left], camera[right]
     # if a camera sees a point twice, both orders of the pair add to the same diagonal block
     twice = np.flatnonzero(rows == columns)
@@ -169,11 +169,10 @@ def _product_levels(
     return sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(row), TREE_WIDTH)
 
 
-def _pairs_of_tracks(
-    tracks: Int[np.ndarray, " points"], start: Int[np.ndarray, " starts"]
-) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+def _pairs_of_tracks(tracks: Int[np.ndarray, " points"]) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
     """All pairs of observations of one point, the later (or same) one first; points are grouped by track length."""
-    lengths = np.bincount(tracks)
+    lengths = np.bincount(tracks, minlength=1)
+    start = np.cumsum(tracks) - tracks
     total = int(lengths @ (np.arange(len(lengths)) * np.arange(1, len(lengths) + 1) // 2))
     left, right = np.empty(total, np.int32), np.empty(total, np.int32)
     first, point, pair = start[sorted_by(tracks, len(lengths))].astype(np.int32), int(lengths[0]), 0

@@ -172,11 +172,11 @@ def build_layout(
         slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(count, np.int32)  # camera-sorted index of each slot
         sorted_index[slots_by_camera] = np.arange(len(slots_by_camera))
+        moves = observations.moves
         pair_lists = pair_layout(
-            camera,
-            sorted_index[slot],
-            tracks,
-            observations.start,
+            camera[moves],
+            sorted_index[slot[moves]],
+            observations.moving_tracks,
             cameras,
             int(sorted_index[empty]),
             factor=factor,

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.frames import free_poses
 from jaxba.structure.sum_trees import sorted_by
 
 
@@ -21,6 +22,7 @@ class ObservationOrder:
     point: Int[np.ndarray, " observations"]  # point of each sorted observation
     tracks: Int[np.ndarray, " points"]  # number of observations of each point
     num_cameras: int  # number of cameras, observed or not
+    moves: Bool[np.ndarray, " observations"]  # whether something of the camera of each sorted observation is optimised
 
     @classmethod
     def of(cls, problem: BundleProblem) -> ObservationOrder:
@@ -29,24 +31,27 @@ class ObservationOrder:
         cameras, points = len(problem.cameras), len(problem.points)
         order = sorted_by(camera, cameras)
         order = order[sorted_by(point[order], points)]
-        return cls(order, camera[order], point[order], np.bincount(point, minlength=points), cameras)
+        tracks = np.bincount(point, minlength=points)
+        return cls(order, camera[order], point[order], tracks, cameras, _moving_cameras(problem)[camera[order]])
 
     @cached_property
-    def start(self) -> Int[np.ndarray, " points_and_one"]:
-        """Position of the first observation of each point; the last entry is the number of observations."""
-        return np.concatenate([[0], np.cumsum(self.tracks)])
+    def moving_tracks(self) -> Int[np.ndarray, " points"]:
+        """Number of observations of each point by cameras of which something is optimised."""
+        return np.bincount(self.point[self.moves], minlength=len(self.tracks))
 
     @cached_property
     def num_pairs(self) -> int:
-        """Number of unordered pairs of observations of one point, an observation with itself included."""
-        tracks = self.tracks.astype(np.int64)
+        """Number of unordered pairs of observations of one point by cameras of which something is optimised, an
+        observation with itself included. Others add nothing to the reduced camera system."""
+        tracks = self.moving_tracks.astype(np.int64)
         return int(np.sum(tracks * (tracks + 1) // 2))
 
     @cached_property
     def num_repeated_pairs(self) -> int:
-        """Number of pairs of different observations of one point by one camera."""
-        new = np.ones(len(self.order), bool)
-        new[1:] = (np.diff(self.point) != 0) | (np.diff(self.camera) != 0)
+        """Number of these pairs that are different observations of one point by one camera."""
+        point, camera = self.point[self.moves], self.camera[self.moves]
+        new = np.ones(len(point), bool)
+        new[1:] = (np.diff(point) != 0) | (np.diff(camera) != 0)
         times = np.diff(np.append(np.flatnonzero(new), len(new)))
         return int(np.sum(times * (times - 1) // 2))
 
@@ -59,3 +64,11 @@ class ObservationOrder:
     def num_observed_points(self) -> int:
         """Number of points with at least one observation."""
         return int(np.count_nonzero(self.tracks))
+
+
+def _moving_cameras(problem: BundleProblem) -> Bool[np.ndarray, " cameras"]:
+    """Of which cameras something is optimised, of a problem `in_frames`: of pose, lens, or a block of a residual."""
+    if problem.lenses is None or problem.residuals.sizes:
+        return np.ones(len(problem.cameras), bool)
+    free_lenses = np.asarray(problem.lenses.free).any(axis=1)
+    return free_poses(problem).any(axis=1) | free_lenses[np.asarray(problem.lenses.index)]
