@@ -88,7 +88,7 @@ class SolveOptions:
 
     pad: bool | None = None
     """Whether array sizes are rounded up to a grid, so that problems of about the same size share one compiled program,
-    also in a persistent compilation cache. Results differ by rounding only, iterations take up to 1.4 times as long.
+    also in a persistent compilation cache. Results differ by rounding only, iterations take 1.1 to 1.6 times as long.
     None: for at most 64 cameras and 60,000 observations, unless compilation is `full`. Padding is for the explicit
     solver, which `auto` then means; with other solvers, with rigs or other residuals, and for larger problems nothing
     is padded, and `Solution.capacity` is None."""

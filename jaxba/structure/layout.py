@@ -151,7 +151,7 @@ def build_layout(
         return found
 
     in_order = lambda values: in_slots(np.asarray(values, np.float64)[order])
-    room = None if capacity is None else room_for(seen, capacity.usual_observations(len(camera)), capacity.points)
+    room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
     by_camera = sorted_by(camera, cameras)
     levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, agreement.within("cameras"))
     camera_levels = with_spare_row(levels, empty)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.frames import free_poses
+from jaxba.problem.hold import every_lens
 from jaxba.structure.sum_trees import sorted_by
 
 
@@ -68,7 +69,10 @@ class ObservationOrder:
 
 def _moving_cameras(problem: BundleProblem) -> Bool[np.ndarray, " cameras"]:
     """Of which cameras something is optimised, of a problem `in_frames`: of pose, lens, or a block of a residual."""
-    if problem.lenses is None or problem.residuals.sizes:
+    if problem.residuals.sizes:
         return np.ones(len(problem.cameras), bool)
-    free_lenses = np.asarray(problem.lenses.free).any(axis=1)
-    return free_poses(problem).any(axis=1) | free_lenses[np.asarray(problem.lenses.index)]
+    lenses = every_lens(problem)
+    lens_of_camera = np.asarray(lenses.index)
+    free_lenses = np.any(lenses.free, axis=1, keepdims=True)
+    free = np.hstack([free_poses(problem), free_lenses[lens_of_camera]])
+    return np.logical_or.reduce(free, axis=1)

@@ -6,9 +6,11 @@ fraction of one. With padding all shapes follow from a `Capacity`, five numbers 
 unusually long tracks or many small blocks (`sum_trees.prefix_levels`). Which cameras share a lens and what is constant
 is data. Padding contains no observations: it adds exact zeros to sums, and its cameras and points never change.
 
-A tenth to a quarter of the slots are padding: up to a ninth from rounding, the others in half-filled chunks of slots.
-Larger problems are not padded (`capacity_of`), since their iterations take as long as compiling does. A problem with
-few points may lose more than others: with padding it may have too many of them for Woodbury's identity
+A tenth to a third of the slots are padding: from rounding, and in half-filled chunks. The grid is coarse for small
+problems, where a program costs more than its padding: of the adjustments of a COLMAP mapper, which take three
+iterations each, 95 on 36 images of KITTI need 30 programs, and 54 with eight numbers of slots an octave. Larger
+problems are not padded (`capacity_of`), since their iterations take as long as compiling does. A problem with few
+points may lose more than others: with padding it may have too many of them for Woodbury's identity
 (structure/density.py)."""
 
 from __future__ import annotations
@@ -19,14 +21,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.hold import every_lens
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
-CAMERAS = (8, 12, 16, 20, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128)  # longer sequences are better factored as bands
+CAMERAS = (8, 16, 32, 48, 64, 96, 128)  # longer sequences are better factored as bands
 LENSES = (0, 1, 4, 16, 64)  # of shared lenses; each takes as many products with the system as it has free numbers
 POINT_CHUNK = 2  # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
 MIN_OBSERVATIONS = 1024  # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
-POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)  # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
+COARSE_OBSERVATIONS = 1 << 14  # slots up to which two sizes an octave suffice, where a step takes 5 ms; then four
+POINTS_PER_CHUNK = (1 / 2, 3 / 4, 1)  # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
 PAIRS_PER_SLOT = 6  # or 2, 4, ... times as many. Windows of kitti00vo have 2.9 to 4.2; spare pairs cost little
 MAX_CAMERAS = CAMERAS[-1]  # most cameras of a padded problem
 MAX_OBSERVATIONS = 1 << 17  # most slots of a padded problem. On Ladybug-49 a step takes 0.4 us per slot
@@ -51,11 +55,6 @@ class Capacity:
         counts = observations.num_cameras, len(observations.tracks), slots_for(observations.tracks)
         return all(n <= most for n, most in zip(counts, (self.cameras, self.points, self.observations), strict=True))
 
-    def usual_observations(self, count: int) -> int:
-        """Room for the observations of a problem: 15/16 of the slots or, where points have few single slots, all."""
-        usual = self.observations * 15 // 16
-        return usual if count <= usual and not self.fixed else self.observations
-
     def __str__(self) -> str:
         return f"{self.cameras} cameras, {self.points} points, {self.observations} observations, {self.pairs} pairs"
 
@@ -63,23 +62,21 @@ class Capacity:
 def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
     """The capacity of a problem: its sizes rounded up to the grid.
 
-    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to eight sizes an octave. Points and pairs get
-    a fixed multiple of the slots, or the next larger one if that is not enough: rounding each on its own would give
-    more programs. `observations` are the sorted ones of the problem, if they are known already. Returns None for
-    problems with rigs or other residuals than those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS` or than the
-    last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
+    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to two sizes an octave, or four if there
+    are many. Points and pairs get a fixed multiple of the slots, or the next larger one if that is not enough: rounding
+    each on its own would give more programs. `observations` are the sorted ones of the problem, if they are known
+    already. Returns None for problems with rigs or other residuals than those of pixels, with more than `MAX_CAMERAS`
+    or `MAX_PAIRS` or than the last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
     observations = observations or ObservationOrder.of(problem)
     cameras, points = observations.num_cameras, len(observations.tracks)
-    if problem.rigs is not None or problem.residuals or cameras > MAX_CAMERAS:
+    if problem.rigs or problem.residuals or cameras > MAX_CAMERAS:
         return None
     needed = slots_for(observations.tracks)
     pairs = observations.num_listed_pairs
     shared_lenses = _num_shared_lenses(problem, observations)
     if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS or shared_lenses > LENSES[-1]:
         return None
-    wanted = max(MIN_OBSERVATIONS, needed)
-    step = _power(wanted) // 16  # slots are 8, 9, ..., 15 times a power of two
-    slots = -(-wanted // step) * step
+    slots = _rounded_slots(needed)
     chunks = slots // POINT_CHUNK
     return Capacity(
         cameras=next(size for size in CAMERAS if size >= cameras),
@@ -92,9 +89,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
 
 def _num_shared_lenses(problem: BundleProblem, observations: ObservationOrder) -> int:
     """Number of lenses that several observed cameras share."""
-    if problem.lenses is None:
-        return 0
-    lens_of_camera = np.asarray(problem.lenses.index)
+    lens_of_camera = np.asarray(every_lens(problem).index)
     observed_cameras = np.unique(observations.camera)
     cameras_of_lens = np.bincount(lens_of_camera[observed_cameras])
     return int(np.count_nonzero(cameras_of_lens > 1))
@@ -122,6 +117,13 @@ def padded_parameters(
     """The problem's cameras and points, padded with zeros to the capacity."""
     padded = lambda rows, count: np.pad(np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0)))
     return padded(problem.cameras, capacity.cameras), padded(problem.points, capacity.points)
+
+
+def _rounded_slots(needed: int) -> int:
+    """The number of slots of the grid at or above those that a problem needs."""
+    power = _power(max(MIN_OBSERVATIONS, needed))
+    step = power // 4 if power <= COARSE_OBSERVATIONS else power // 8  # of sizes from half of the power up to it
+    return max(MIN_OBSERVATIONS, -(-needed // step) * step)
 
 
 def _power(count: int) -> int:

@@ -159,8 +159,8 @@ def unknowns_of(
     poses_free = free_poses(problem)
     own_sizes = problem.residuals.sizes
     own_free = np.ones((cameras, sum(own_sizes)), bool)
-    general = problem.lenses is not None or problem.constants is not None
-    may_hold = capacity is not None and general  # something is constant in some problem of this shape
+    # something may be constant in another problem of this shape
+    may_hold = bool(capacity and (problem.lenses or problem.constants))
     lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:], own_free])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
     free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
@@ -169,7 +169,7 @@ def unknowns_of(
     any_held = agreement.size("constant points", int(held.any()))
     apart = -1 - np.arange(len(seen))  # names of cameras that have nothing in common
     padded = lambda names: np.where(seen, np.pad(names, (0, padding)), apart)
-    lens_room = 0 if capacity is None else capacity.lenses
+    lens_room = capacity.lenses if capacity else 0
     lens_names = padded(index) if not lens_room else np.where(seen, np.pad(index, (0, padding)), NO_LENS)
     shares = Sharing.of(lens_names)
     all_shared = bool(np.isin(shares.index, shares.owners)[seen].all())

@@ -261,9 +261,14 @@ def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common()
     assert two_level.history.cg_iterations.sum() < plain.history.cg_iterations.sum()
 
 
-def test_padding_leaves_lenses_as_they_are():
-    solution = solve(shared(), "ceres", pad=True)
-    assert solution.capacity is None
+def test_padding_changes_neither_what_lenses_share_nor_what_they_hold():
+    exact = solve(shared(), "ceres", pad=False)
+    padded = solve(shared(), "ceres", pad=True)
+    assert padded.capacity is not None
+    np.testing.assert_allclose(padded.final_cost, exact.final_cost, rtol=1e-9)
+    lenses = padded.problem.cameras[:, 6:]
+    assert (lenses[~FREE[INDEX]] == shared().cameras[:, 6:][~FREE[INDEX]]).all()
+    assert np.ptp(lenses[INDEX == 0], axis=0).max() == 0
 
 
 @pytest.mark.parametrize("method", ["deeplm", "stba"])

@@ -13,7 +13,7 @@ import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxba import BundleProblem, Layout, build_layout
+from jaxba import BundleProblem, Layout, build_layout, hold
 from jaxba.structure import covisibility
 from jaxba.structure.layout import CAMERA_CHUNK, NO_SYSTEM
 from jaxba.structure.sum_trees import TREE_WIDTH, fitting_width, sum_tree, with_spare_row
@@ -284,6 +284,24 @@ def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points,
         layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
+
+
+def test_pairs_of_constant_cameras_are_not_listed():
+    """What nothing of a camera can change has no block in the reduced camera system."""
+    problem = support.tiny()
+    constant = np.array([1, 3])
+    held = hold(problem, poses=constant, lenses=constant)
+    layout = build_layout(held, grid=False)
+    slots = np.flatnonzero(layout.slot_mask)
+    camera, point = layout.slot_camera[slots], layout.slot_point[slots]
+    moves = ~np.isin(camera, constant)
+    tracks = np.bincount(point[moves])
+    camera_of_sorted = support.by_camera(layout, np.asarray(layout.slot_camera))
+    is_observation = support.by_camera(layout, np.asarray(layout.slot_mask))
+    listed = is_observation[layout.pairs.left] & is_observation[layout.pairs.right]
+    assert listed.sum() == np.sum(tracks * (tracks + 1) // 2)
+    for side in (layout.pairs.left, layout.pairs.right):
+        assert not np.isin(camera_of_sorted[side][listed], constant).any()
 
 
 def test_the_number_of_pairs_is_that_of_the_track_lengths():
