@@ -144,7 +144,7 @@ def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path
 def test_padded_sizes_are_reported(tiny, capsys):
     fast = [str(tiny), "--max-iterations", "1", "--policy", "ceres", "--pad", "yes"]
     assert run(fast) == 0
-    assert "padded to 8 cameras, 128 points, 1024 observations, 6144 pairs\n" in capsys.readouterr().out
+    assert "padded to 8 cameras, 256 points, 1024 observations, 6144 pairs\n" in capsys.readouterr().out
     assert run([*fast, "--linear-solver", "implicit"]) == 0
     assert "padded to" not in capsys.readouterr().out
 
