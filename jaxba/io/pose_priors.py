@@ -28,14 +28,14 @@ class Measured(NamedTuple):
     loss: Loss
 
 
-def measured_positions(whole: BundleProblem, config: Any, prior_options: Any, priors: Any) -> Measured:
+def measured_positions(problem: BundleProblem, config: Any, prior_options: Any, priors: Any) -> Measured:
     """What COLMAP's pose priors and their options say of the images of a config. Raises ValueError: nothing, or one is
     in degrees."""
-    assert whole.labels is not None
+    assert problem.labels is not None
     by_image = priors
     if not isinstance(priors, Mapping):
         by_image = {prior.corr_data_id.id: prior for prior in priors}
-    known = set(config.images) & set(whole.labels.images.tolist())
+    known = set(config.images) & set(problem.labels.images.tolist())
     used = {image: prior for image, prior in by_image.items() if image in known and np.isfinite(prior.position).all()}
     if not used:
         raise ValueError("pose_priors: no image of the config has a position")
@@ -50,7 +50,7 @@ def measured_positions(whole: BundleProblem, config: Any, prior_options: Any, pr
     return Measured(
         positions=np.array([prior.position for prior in used.values()], np.float64),
         covariances=np.array(covariances, np.float64),
-        images=whole.labels.positions("image", used),
+        images=problem.labels.positions("image", used),
         loss=_prior_loss(prior_options),
     )
 

@@ -1,40 +1,28 @@
 """pycolmap's objects as problems, and what was found back into them.
 
-A `pycolmap.Reconstruction` is written to a temporary folder and read as every COLMAP model is. Source: COLMAP 4.2,
-`BundleAdjustmentOptions`, `BundleAdjustmentConfig`."""
+Source: COLMAP 4.2, `BundleAdjustmentOptions`, `BundleAdjustmentConfig`."""
 
 from __future__ import annotations
 
 import importlib
-import re
-import tempfile
-import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxba.io.colmap import read_colmap, write_colmap
+from jaxba.io.colmap.memory import NAME, read_records, write_records
+from jaxba.io.colmap.read import registered
+from jaxba.io.colmap.write import check_points, mean_errors, with_cameras
+from jaxba.io.pycolmap_config import chosen_part, constrained, without_views_behind
 from jaxba.io.pycolmap_options import options_of
-from jaxba.problem.bundle_problem import (
-    BundleProblem,
-    NothingObserved,
-    ProblemError,
-    ProblemWarning,
-)
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.checks import shown
-from jaxba.problem.facing import set_aside, views_behind
-from jaxba.problem.gauge import Gauge, fixed_gauge
-from jaxba.problem.geometry import residuals
-from jaxba.problem.hold import every_lens, hold
-from jaxba.problem.labels import Labels
-from jaxba.problem.part import part
-
-GAUGES: dict[str, Gauge] = {"TWO_CAMS_FROM_WORLD": "two-cameras", "THREE_POINTS": "three-points"}
-"""Gauges by the names that pycolmap has for them."""
+from jaxba.problem.geometry import COLMAP_FLIP, residuals
+from jaxba.problem.hold import every_lens
 
 OLDEST = "3.12"
 """The first pycolmap with rigs and frames."""
+
+SAME_PIXEL = 1e-6  # pixels; a problem's are the key-points', but for the rounding of a principal point added to them
 
 
 def from_pycolmap(reconstruction: Any, config: Any = None, options: Any = None) -> BundleProblem:
@@ -56,7 +44,7 @@ def from_pycolmap(reconstruction: Any, config: Any = None, options: Any = None) 
         ValueError: `config` names what is not in the problem, or an argument is of another kind."""
     check_reconstruction(reconstruction)
     options = options_of(options)
-    problem = chosen_part(whole_problem(reconstruction, options), reconstruction, config, options)
+    problem = chosen_part(reconstruction, config, options)
     return constrained(without_views_behind(problem), reconstruction, config, options)
 
 
@@ -69,93 +57,6 @@ def check_reconstruction(reconstruction: Any) -> None:
         raise ValueError(f"this needs pycolmap {OLDEST} or newer, which has rigs; installed is {version}")
 
 
-def whole_problem(reconstruction: Any, options: Any) -> BundleProblem:
-    """The problem of everything in a reconstruction. Raises: as `from_pycolmap`."""
-    with tempfile.TemporaryDirectory() as folder:
-        reconstruction.write_binary(folder)
-        with warnings.catch_warnings(record=True) as notes:
-            warnings.simplefilter("always")
-            try:
-                problem = read_colmap(folder, refine_principal_point=options.refine_principal_point)
-            except ProblemError as error:
-                raise type(error)(_without_folder(str(error), folder)) from None
-    for note in notes:
-        warnings.warn(_without_folder(str(note.message), folder), note.category, stacklevel=3)
-    return problem
-
-
-def _without_folder(text: str, folder: str) -> str:
-    """A message about a file of a temporary folder as one about the reconstruction."""
-    return re.sub(rf"{re.escape(folder)}(/\w+\.bin)?", "the reconstruction", text)
-
-
-def chosen_part(problem: BundleProblem, reconstruction: Any, config: Any, options: Any) -> BundleProblem:
-    """The part of a whole problem that a config means.
-
-    Args:
-        problem: everything in the reconstruction, perhaps moved.
-        reconstruction: a `pycolmap.Reconstruction`.
-        config: a `pycolmap.BundleAdjustmentConfig`, or None.
-        options: a `pycolmap.BundleAdjustmentOptions`.
-
-    Raises: as `from_pycolmap`."""
-    assert problem.labels is not None
-    of_part = {} if config is None else _chosen(problem.labels, reconstruction, config)
-    least = getattr(options, "min_track_length", 0)
-    if least:
-        of_part["min_track"] = least
-    return part(problem, **of_part) if of_part else problem
-
-
-def without_views_behind(problem: BundleProblem) -> BundleProblem:
-    """The problem without views of points behind their image, itself if there are none. Raises NothingObserved: no
-    other view is there."""
-    behind = views_behind(problem)
-    if not behind.any():
-        return problem
-    if behind.all():
-        raise NothingObserved("the reconstruction: every point lies behind the images that see it")
-    set_aside(problem)  # says which images face away
-    return problem.subset(~behind)
-
-
-def constrained(problem: BundleProblem, reconstruction: Any, config: Any, options: Any) -> BundleProblem:
-    """The problem of `chosen_part` with what config and options hold, and in the gauge of the config. Arguments as
-    there. Raises: as `from_pycolmap`."""
-    labels = problem.labels
-    assert labels is not None
-    problem = _held(problem, options)
-    if config is None:
-        return problem
-    known = set(labels.images.tolist())
-    frames = {*config.constant_rig_from_world_poses}
-    of_frames = {image.image_id for image in reconstruction.images.values() if image.frame_id in frames}
-    images = labels.positions("image", sorted(known & of_frames))
-    if problem.rigs is not None and problem.rigs.free is not None:
-        images = images[~np.asarray(problem.rigs.free)[images]]  # those say where their frame is
-    lenses = {*config.constant_cam_intrinsics} & set(labels.lenses.tolist())
-    sensors = {sensor.id for sensor in config.constant_sensor_from_rig_poses} & set(labels.lenses.tolist())
-    points = {*config.constant_points} & set(labels.points.tolist())
-    problem = hold(
-        problem,
-        poses=images,
-        points=labels.positions("point", sorted(points)),
-        lenses=labels.positions("lens", sorted(lenses)),
-        extrinsics=labels.positions("lens", sorted(sensors)),
-    )
-    return gauged(problem, GAUGES.get(config.fixed_gauge.name, "free"))
-
-
-def everything(reconstruction: Any) -> Any:
-    """The config of all registered images, in the gauge of two cameras, as `pycolmap.bundle_adjustment` has it."""
-    pycolmap = importlib.import_module("pycolmap")
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in reconstruction.reg_image_ids():
-        config.add_image(image)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    return config
-
-
 def any_far_off(problem: BundleProblem, reconstruction: Any) -> bool:
     """Whether a point is seen farther from its pixel than the diagonal of the image, where no step leads it back."""
     assert problem.labels is not None
@@ -165,72 +66,57 @@ def any_far_off(problem: BundleProblem, reconstruction: Any) -> bool:
     return bool((np.linalg.norm(residuals(problem), axis=1) > diagonals[lens]).any())
 
 
-def gauged(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
-    """The problem in a gauge; without one where it has too few points for that, as COLMAP goes on."""
-    try:
-        return fixed_gauge(problem, gauge)
-    except ProblemError:
-        return problem
-
-
-def _chosen(labels: Labels, reconstruction: Any, config: Any) -> dict[str, Any]:
-    """Images and points of a config, as `part` takes them. Raises ValueError: the reconstruction has no such one."""
-    if not hasattr(config, "fixed_gauge"):
-        raise ValueError(f"config must be a pycolmap.BundleAdjustmentConfig, not {shown(config)}")
-    points = {*config.variable_points, *config.constant_points}
-    for kind, items in (("image", config.images), ("point3D", points)):
-        exists = getattr(reconstruction, f"exists_{kind}")
-        lost = [item for item in items if not exists(item)]
-        if lost:
-            raise ValueError(f"config names {kind} {min(lost)}, which the reconstruction does not have")
-    images = set(config.images) & set(labels.images.tolist())
-    points &= set(labels.points.tolist())
-    return {
-        "images": labels.positions("image", sorted(images)),
-        "points": labels.positions("point", sorted(points)),
-    }
-
-
-def _held(problem: BundleProblem, options: Any) -> BundleProblem:
-    """The problem with constant what options do not refine."""
-    groups = {"focal": options.refine_focal_length, "distortion": options.refine_extra_params}
-    parts: dict[str, Any] = {"numbers": [name for name, refined in groups.items() if not refined]}
-    if not getattr(options, "refine_points3D", True):
-        parts["points"] = "all"
-    if not options.refine_sensor_from_rig:
-        parts["extrinsics"] = "all"
-    if not options.refine_rig_from_world:
-        parts["poses"] = "frames"
-    if getattr(options, "constant_rig_from_world_rotation", False):
-        parts["rotations"] = "frames"
-    return hold(problem, **parts)
-
-
 def update(reconstruction: Any, problem: BundleProblem) -> None:
     """Gives a `pycolmap.Reconstruction` the poses, points, lenses and places in rigs of a problem that was made of it,
-    and the errors of its points; the rest of it stays. Raises ProblemError: the problem is another one's."""
-    import pycolmap
+    and the errors of points all of whose observations the problem has; the rest of it stays. Raises ProblemError: the
+    problem is another one's, or not finite; the reconstruction is as it was."""
+    _check_is_of(reconstruction, problem)
+    labels = problem.labels
+    assert labels is not None
+    check_points(problem, labels.points, NAME)
+    model = read_records(reconstruction, labels.images.tolist())
+    images, _ = registered(model)
+    place = {image.id: image for image in images}
+    of_problem = [place[number] for number in labels.images.tolist()]
+    write_records(reconstruction, model, with_cameras(model, of_problem, problem, NAME))
+    views = np.bincount(problem.point_index, minlength=problem.num_points).tolist()
+    errors = mean_errors(problem.replace(whitening=None)).tolist()
+    positions = np.asarray(problem.points, np.float64)
+    for number, position, error, seen in zip(labels.points.tolist(), positions, errors, views, strict=True):
+        point = reconstruction.point3D(number)
+        point.xyz = position
+        if seen == point.track.length():
+            point.error = error
 
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", ProblemWarning)  # said when it was read
-        old, new = Path(folder, "old"), Path(folder, "new")
-        old.mkdir()
-        reconstruction.write_binary(old)
-        try:
-            write_colmap(problem, new, like=old)
-        except ProblemError as error:
-            message = str(error).replace(str(new), "the reconstruction").replace(str(old), "this reconstruction")
-            raise ProblemError(message) from None
-        found = pycolmap.Reconstruction(new)
-    for identity, camera in found.cameras.items():
-        reconstruction.camera(identity).params = camera.params
-    for identity, rig in found.rigs.items():
-        for sensor, place in rig.non_ref_sensors.items():
-            if place is not None:
-                reconstruction.rig(identity).set_sensor_from_rig(sensor, place)
-    for identity, frame in found.frames.items():
-        if frame.has_pose():
-            reconstruction.frame(identity).rig_from_world = frame.rig_from_world
-    for identity, point in found.points3D.items():
-        own = reconstruction.point3D(identity)
-        own.xyz, own.error = np.asarray(point.xyz), point.error
+
+def _check_is_of(reconstruction: Any, problem: BundleProblem) -> None:
+    """Raises ProblemError: an image or a point of a problem is not in a reconstruction, or the first observation of an
+    image is no key-point there."""
+    labels = problem.labels
+    same = labels is not None
+    if labels is not None:
+        same = all(map(reconstruction.exists_image, labels.images.tolist()))
+        same = same and all(map(reconstruction.exists_point3D, labels.points.tolist()))
+        same = same and _see_the_same(reconstruction, problem)
+    if not same:
+        raise ProblemError(f"cannot write {NAME}: the problem is not one of this reconstruction")
+
+
+def _see_the_same(reconstruction: Any, problem: BundleProblem) -> bool:
+    """Whether the first observation of each image of a problem is a key-point of that image and point."""
+    labels = problem.labels
+    assert labels is not None
+    centered = every_lens(problem).all_bal
+    cameras, first = np.unique(problem.camera_index, return_index=True)
+    points = labels.points[problem.point_index[first]]
+    pixels = np.asarray(problem.observations)[first]
+    for number, point, pixel in zip(labels.images[cameras].tolist(), points.tolist(), pixels, strict=True):
+        image = reconstruction.image(number)
+        if centered:
+            camera = image.camera
+            pixel = pixel * COLMAP_FLIP[:2] + [camera.principal_point_x, camera.principal_point_y]
+        elements = reconstruction.point3D(point).track.elements
+        keys = [image.point2D(element.point2D_idx).xy for element in elements if element.image_id == number]
+        if not any(np.abs(key - pixel).max() <= SAME_PIXEL for key in keys):
+            return False
+    return True

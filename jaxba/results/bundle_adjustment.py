@@ -13,16 +13,9 @@ from typing import Any
 import numpy as np
 
 from jaxba.io.pose_priors import alignment_to, measured_positions, with_positions
+from jaxba.io.pycolmap_config import chosen_part, constrained, everything, without_views_behind
 from jaxba.io.pycolmap_options import ceres_options, changed, ignored, loss_of, options_of
-from jaxba.io.reconstruction import (
-    any_far_off,
-    check_reconstruction,
-    chosen_part,
-    constrained,
-    everything,
-    whole_problem,
-    without_views_behind,
-)
+from jaxba.io.reconstruction import any_far_off, check_reconstruction
 from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem, NothingObserved, ProblemWarning
 from jaxba.problem.checks import shown
@@ -146,12 +139,11 @@ class BundleAdjuster:
     def _problem(self, options: Any) -> tuple[BundleProblem, list[Similarity], bool]:
         """The problem to solve, how the whole reconstruction is first moved to the priors, and whether points lie
         behind images that see them."""
-        whole = whole_problem(self.reconstruction, options)
-        measured = [measured_positions(whole, self.config, *pair) for pair in self.priors]
-        moves = [alignment_to(whole, positions) for positions in measured]
+        part = chosen_part(self.reconstruction, self.config, options)
+        measured = [measured_positions(part, self.config, *pair) for pair in self.priors]
+        moves = [alignment_to(part, positions) for positions in measured]
         for move in moves:
-            whole = transformed(whole, move)
-        part = chosen_part(whole, self.reconstruction, self.config, options)
+            part = transformed(part, move)
         seen = without_views_behind(part)
         problem = constrained(seen, self.reconstruction, self.config, options)
         for positions in measured:

@@ -174,6 +174,7 @@ def _packed(record: Any) -> bytes:
 
 
 def _packed_points(model: Model) -> Iterator[bytes]:
+    assert model.tracks is not None
     for rows, elements, is_head in _blocks(model.points["length"].astype(np.int64)):
         codes = np.empty(len(is_head), np.uint8)
         codes[is_head] = np.frombuffer(model.points[rows].tobytes(), np.uint8)

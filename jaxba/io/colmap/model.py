@@ -124,12 +124,12 @@ class Frame:
 class Model:
     """A COLMAP model. Records are in the order of the files."""
 
-    folder: str
-    suffix: str  # `.bin` or `.txt`
+    folder: str  # or what else messages call it, without a suffix
+    suffix: str  # `.bin` or `.txt`; of a model in memory empty
     cameras: dict[int, Camera]
     images: dict[int, Image]
     points: Shaped[np.ndarray, " points"]  # of type `POINT`
-    tracks: Shaped[np.ndarray, " elements"]  # of type `TRACK`, point after point
+    tracks: Shaped[np.ndarray, " elements"] | None  # of type `TRACK`, point after point; None if they were not read
     rigs: dict[int, Rig] | None  # None before COLMAP 3.12, where all images are registered
     frames: dict[int, Frame] | None
 
@@ -145,8 +145,8 @@ class Model:
         return {image: frame for frame in (self.frames or {}).values() for _, image in frame.images}
 
     def file(self, part: str) -> str:
-        """Name of a file for messages."""
-        return file_name(self.folder, part + self.suffix)
+        """Name of a file for messages; of a model in memory its own."""
+        return file_name(self.folder, part + self.suffix) if self.suffix else self.folder
 
 
 def file_name(folder: str, file: str) -> str:

@@ -64,8 +64,10 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
 
 
 def _track_notes(table: Ordered, views: Views) -> list[str]:
-    """Lines on points whose tracks are not those of their key-points."""
+    """Lines on points whose tracks are not those of their key-points; none if tracks were not read."""
     heads, elements = table.model.points, table.model.tracks
+    if elements is None:
+        return []
     point = np.repeat(np.argsort(table.order).astype(np.int32), heads["length"].astype(np.int64))
     image, registered = _positions(np.array([image.id for image in table.images], np.uint32), elements["image"])
     first, index = table.first_key, elements["key"]

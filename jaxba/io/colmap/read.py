@@ -61,7 +61,7 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
     model = read_model(folder)
     assembled = assemble(model, refine_principal_point=refine_principal_point)
     report(assembled.notes, strict=strict)
-    report(_hints(model))
+    report([*lens_hints(model), *_pose_hints(model)])
     return assembled.problem
 
 
@@ -121,8 +121,8 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     return Assembled(problem, seeing, points, keys, notes)
 
 
-def _hints(model: Model) -> list[str]:
-    """What looks wrong in a model, one line each."""
+def lens_hints(model: Model) -> list[str]:
+    """What looks wrong in the cameras of a model, one line each."""
     odd = []
     for camera in model.cameras.values():
         if camera.width and camera.height and camera.focals:
@@ -134,11 +134,15 @@ def _hints(model: Model) -> list[str]:
         x, y = camera.principal_point
         return f"camera {camera.id}: pixel {x:g}, {y:g} of {camera.width} x {camera.height}"
 
+    return counted(model.file("cameras"), odd, "principal point", "at the edge of the image", place)
+
+
+def _pose_hints(model: Model) -> list[str]:
+    """Whether images have other poses than their frames give them, one line."""
     frames = model.frame_of
     other = [one for one in model.images.values() if one.id in frames and differ(one.pose, _posed(model, one).pose)]
     where = f"with another pose than in {model.file('frames')}, which counts"
-    notes = counted(model.file("cameras"), odd, "principal point", "at the edge of the image", place)
-    return notes + counted(model.file("images"), other, "image", where)
+    return counted(model.file("images"), other, "image", where)
 
 
 def _posed(model: Model, image: Image) -> Image:
@@ -169,7 +173,7 @@ def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
     return sensors[at].from_rig if at else None
 
 
-def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
+def rigs_of(model: Model, images: list[Image]) -> Rigs | None:
     """The rigs of a problem of these images; None if no two of them are of one frame."""
     frames = model.frame_of
     ids = [frames[image.id].id if image.id in frames else -1 for image in images]
@@ -230,4 +234,4 @@ def _problem(
         np.array(cameras),
         heads["id"],
     )
-    return problem.replace(rigs=_rigs_of(model, images), labels=labels)
+    return problem.replace(rigs=rigs_of(model, images), labels=labels)

@@ -176,6 +176,7 @@ def _joined(record: Any) -> bytes:
 
 
 def _point_lines(model: Model) -> Iterator[bytes]:
+    assert model.tracks is not None
     elements = [f" {image} {key}" for image, key in model.tracks.tolist()]
     at = 0
     columns = (model.points[field].tolist() for field in ("id", "xyz", "rgb", "error", "length"))

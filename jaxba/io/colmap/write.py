@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer
 
 from jaxba.io.colmap import model as records
 from jaxba.io.colmap.files import has_parts, read_model, write_model
 from jaxba.io.colmap.lenses import with_lens
 from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model, Rig, Sensor
-from jaxba.io.colmap.poses import colmap_poses, composed, inverse
-from jaxba.io.colmap.read import Assembled, assemble, place_in_rig
+from jaxba.io.colmap.poses import bal_poses, colmap_poses, composed, inverse
+from jaxba.io.colmap.read import Assembled, assemble, place_in_rig, rigs_of
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import grouped, numbered
 from jaxba.problem import geometry
@@ -91,9 +92,8 @@ def check_model(problem: BundleProblem, folder: StrPath) -> None:
 def _with_positive_focals(problem: BundleProblem) -> BundleProblem:
     """The problem with BAL's cameras of a negative focal length as cameras of a positive one that are rolled by 180
     degrees about their view: the same pixels, since `f p` is `(-f)(-p)`. In rigs they stay."""
-    bal = problem.lenses is None or problem.lenses.all_bal
     rolled = np.asarray(problem.cameras)[:, 6] < 0
-    if not bal or problem.rigs is not None or not rolled.any():
+    if not _is_bal(problem) or problem.rigs is not None or not rolled.any():
         return problem
     cameras = np.array(problem.cameras, np.float64)
     roll = np.diag([-1.0, -1.0, 1.0])
@@ -106,23 +106,45 @@ def _with_positive_focals(problem: BundleProblem) -> BundleProblem:
 def with_problem(model: Model, problem: BundleProblem, target: str) -> tuple[Model, Assembled]:
     """A model with the lenses, poses and places in rigs of a problem that was made of it, and what it was made of.
     `target` is what messages say is written. Raises ProblemError: another model's problem, or unstorable."""
-    bal = problem.lenses is None or problem.lenses.all_bal
-    problem = _with_positive_focals(problem)
-    assembled = assemble(model, refine_principal_point=not bal)
+    assembled = assemble(model, refine_principal_point=not _is_bal(problem))
     if (problem.num_cameras, problem.num_points) != (len(assembled.images), len(assembled.points)):
         raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(model.folder)}")
-    _check_finite(model, assembled, problem, target)
-    model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
-    return _with_poses(_with_places(model, assembled, problem), assembled, problem), assembled
+    check_points(problem, model.points["id"][assembled.points], target)
+    return with_cameras(model, assembled.images, problem, target), assembled
 
 
-def _check_finite(model: Model, assembled: Assembled, problem: BundleProblem, target: str) -> None:
-    poses, points = np.asarray(problem.cameras)[:, :6], np.asarray(problem.points)
-    pose_name = lambda at: f"the pose of {assembled.images[at]}"
-    point_name = lambda at: f"point {model.points['id'][assembled.points[at]]}"
-    for values, name in ((poses, pose_name), (points, point_name)):
-        if not (finite := np.isfinite(values).all(axis=1)).all():
-            raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
+def with_cameras(model: Model, images: list[Image], problem: BundleProblem, target: str) -> Model:
+    """A model with the lenses, poses and places in rigs of a problem.
+
+    Args:
+        model: any model.
+        images: the images of it that are the problem's cameras, in the poses of their frames.
+        problem: may have been optimised.
+        target: what messages say is written.
+
+    Raises ProblemError: a pose is not finite, a camera would be impossible, or its images have different lenses."""
+    bal = _is_bal(problem)
+    problem = _with_positive_focals(problem)
+    _check_finite(np.asarray(problem.cameras)[:, :6], lambda at: f"the pose of {images[at]}", target)
+    model = replace(model, cameras={**model.cameras, **_new_cameras(model, images, problem, bal, target)})
+    return _with_poses(_with_places(model, images, problem), images, problem)
+
+
+def check_points(problem: BundleProblem, ids: Integer[np.ndarray, " points"], target: str) -> None:
+    """Raises ProblemError: a point of a problem, whose points have these ids, is not finite; `target` is what cannot be
+    written."""
+    _check_finite(np.asarray(problem.points), lambda at: f"point {ids[at]}", target)
+
+
+def _check_finite(values: Float[np.ndarray, "n numbers"], name: Callable[[int], str], target: str) -> None:
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
+
+
+def _is_bal(problem: BundleProblem) -> bool:
+    """Whether all lenses of a problem are BAL's."""
+    return problem.lenses is None or problem.lenses.all_bal
 
 
 def _with_points(
@@ -146,6 +168,7 @@ def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observ
     code = lambda image, key: np.asarray(image, np.uint64) << np.uint64(32) | np.asarray(key, np.uint64)
     point = np.repeat(np.arange(len(heads)), heads["length"].astype(np.int64))
     elements = model.tracks
+    assert elements is not None
     cut = np.isin(code(elements["image"], elements["key"]), code(ids, assembled.keys)[gone])
     touched = assembled.points[problem.point_index[gone]]
     left = np.bincount(assembled.points[problem.point_index[~gone]], minlength=len(heads))  # tracks may be wrong
@@ -162,11 +185,11 @@ def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observ
 
 
 def _new_cameras(
-    model: Model, assembled: Assembled, problem: BundleProblem, bal: bool, target: str
+    model: Model, images: list[Image], problem: BundleProblem, bal: bool, target: str
 ) -> dict[int, Camera]:
     """The lenses of the problem by the ids of their cameras."""
     found: dict[int, np.ndarray] = {}
-    for image, lens in zip(assembled.images, np.asarray(problem.cameras, np.float64)[:, 6:], strict=True):
+    for image, lens in zip(images, np.asarray(problem.cameras, np.float64)[:, 6:], strict=True):
         if (found.setdefault(image.camera, lens) != lens).any():
             raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different intrinsics")
     cameras = {identity: with_lens(model.cameras[identity], lens, bal=bal) for identity, lens in found.items()}
@@ -176,15 +199,15 @@ def _new_cameras(
     return cameras
 
 
-def _with_poses(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
+def _with_poses(model: Model, of_problem: list[Image], problem: BundleProblem) -> Model:
     """The model with the poses of the problem, those that have not changed as they were, bit by bit.
 
     The pose of a frame is that of its reference sensor's image if the problem has that, else it follows from another.
     """
     cameras = np.asarray(problem.cameras, np.float64)[:, :6]
-    same = (cameras == np.asarray(assembled.problem.cameras)[:, :6]).all(axis=1)
+    same = (cameras == bal_poses([image.pose for image in of_problem])).all(axis=1)
     images, frames, changed, known = dict(model.images), dict(model.frames or {}), set(), set()
-    for image, kept, pose in zip(assembled.images, same, colmap_poses(cameras), strict=True):
+    for image, kept, pose in zip(of_problem, same, colmap_poses(cameras), strict=True):
         known.add(image.id)
         images[image.id] = replace(images[image.id], pose=image.pose if kept else pose)
         if not kept:
@@ -204,9 +227,10 @@ def _with_poses(model: Model, assembled: Assembled, problem: BundleProblem) -> M
     return replace(model, images=images, frames=None if model.frames is None else frames)
 
 
-def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
+def _with_places(model: Model, images: list[Image], problem: BundleProblem) -> Model:
     """The model with its cameras where the problem's rigs have them."""
-    old, new = assembled.problem.rigs, problem.rigs
+    new = problem.rigs
+    old = None if new is None else rigs_of(model, images)
     if old is None or new is None or model.rigs is None:
         return model
     turned = (old.rotation != new.rotation).any(axis=(1, 2))
@@ -215,7 +239,7 @@ def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> 
     poses = colmap_poses(np.hstack([angle_axis(new.rotation), new.translation]))
     moved = {
         (model.frame_of[image.id].rig, image.camera): (pose, turn)
-        for image, pose, turn in zip(assembled.images, poses, turned, strict=True)
+        for image, pose, turn in zip(images, poses, turned, strict=True)
     }
 
     def placed(rig: Rig, sensor: Sensor) -> Sensor:
