@@ -40,7 +40,10 @@ def chosen_part(reconstruction: Any, config: Any, options: Any) -> BundleProblem
         return _assembled(read_whole(reconstruction, least), options).problem
     images, points = _chosen(reconstruction, config)
     model = read_part(reconstruction, images, points, least)
-    assembled = _assembled(model, options)
+    try:
+        assembled = _assembled(model, options)
+    except NothingObserved:
+        raise NothingObserved(f"{NAME}: no observation is left of what the config means") from None
     problem, labels = assembled.problem, assembled.problem.labels
     assert labels is not None
     whole = np.isin(labels.points, np.array(points, labels.points.dtype))

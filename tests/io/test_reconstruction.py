@@ -122,6 +122,10 @@ def test_what_cannot_be_is_one_line_without_a_temporary_name():
         jaxba.from_pycolmap("sparse/0")
     with pytest.raises(jaxba.ProblemError, match=r"^the reconstruction: no image sees a point$"):
         jaxba.from_pycolmap(pycolmap.Reconstruction())
+    with pytest.raises(
+        jaxba.ProblemError, match=r"^the reconstruction: no observation is left of what the config means$"
+    ):
+        jaxba.from_pycolmap(model, config)
     config.add_image(77)
     with pytest.raises(ValueError, match="config names image 77, which the reconstruction does not have"):
         jaxba.from_pycolmap(model, config)

@@ -121,11 +121,12 @@ def _other_keys(reconstruction: Any, points: Iterable[int], known: dict[int, Key
                 elements.setdefault(image, []).append((element.point2D_idx, point))
     others = {}
     for number, image in _registered(reconstruction, elements).items():
-        others[number] = keys = _no_keys(image)
+        keys = _no_keys(image)
         for at, point in elements[number]:
             key = image.point2D(at)
             if key.point3D_id == point:
                 keys[at] = (key.xy, point)
+                others[number] = keys
     return others
 
 
