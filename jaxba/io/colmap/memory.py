@@ -11,7 +11,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from jaxba.io.colmap.model import KEY, NO_POINT, POINT, Camera, Frame, Image, Model, Rig, Sensor, check_model
+from jaxba.io.colmap.model import (
+    CAMERA_SENSOR,
+    KEY,
+    NO_POINT,
+    POINT,
+    Camera,
+    Frame,
+    Image,
+    Model,
+    Rig,
+    Sensor,
+    check_model,
+)
 from jaxba.io.colmap.poses import Pose
 
 NAME = "the reconstruction"
@@ -62,22 +74,24 @@ def write_records(reconstruction: Any, old: Model, new: Model) -> None:
     """Gives a reconstruction the cameras, rigs and frames of a model that are not as in the model that was read."""
     import pycolmap
 
-    def rigid(pose: Pose) -> Any:
+    def rotation(pose: Pose) -> Any:
         w, *xyz = pose[:4]
-        return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*xyz, w])), np.array(pose[4:]))
+        return pycolmap.Rotation3d(np.array([*xyz, w]))
 
     for number, camera in new.cameras.items():
         if camera.params != old.cameras[number].params:
             reconstruction.camera(number).params = np.array(camera.params)
     for number, rig in (new.rigs or {}).items():
-        for sensor, before in zip(rig.sensors, (old.rigs or {})[number].sensors, strict=True):
-            if sensor.from_rig is not None and sensor.from_rig != before.from_rig:
-                kind = pycolmap.SensorType(sensor.type)
-                identity = pycolmap.sensor_t(type=kind, id=sensor.id)
-                reconstruction.rig(number).set_sensor_from_rig(identity, rigid(sensor.from_rig))
+        if rig != (old.rigs or {})[number]:
+            places = {(sensor.type, sensor.id): sensor.from_rig for sensor in rig.sensors}
+            for sensor, place in reconstruction.rig(number).non_ref_sensors.items():
+                pose = places[int(sensor.type), sensor.id]
+                if pose is not None:
+                    place.rotation, place.translation = rotation(pose), np.array(pose[4:])
     for number, frame in (new.frames or {}).items():
         if frame.pose != (old.frames or {})[number].pose:
-            reconstruction.frame(number).rig_from_world = rigid(frame.pose)
+            pose = pycolmap.Rigid3d(rotation(frame.pose), np.array(frame.pose[4:]))
+            reconstruction.frame(number).rig_from_world = pose
 
 
 def _unit_camera() -> Any:
@@ -175,11 +189,10 @@ def _camera_of(camera: Any) -> Camera:
 
 
 def _frame_of(frame: Any, images: Container[int]) -> Frame:
-    """A frame with what it has of some images."""
-    data = [
-        (int(datum.sensor_id.type), datum.sensor_id.id, datum.id) for datum in frame.image_ids if datum.id in images
-    ]
-    return Frame(frame.frame_id, frame.rig_id, _pose_of(frame.rig_from_world), tuple(sorted(data)))
+    """A frame with what cameras took for it of some images."""
+    data = [(int(datum.sensor_id.type), datum.sensor_id.id, datum.id) for datum in frame.data_ids]
+    taken = [datum for datum in data if datum[0] == CAMERA_SENSOR and datum[2] in images]
+    return Frame(frame.frame_id, frame.rig_id, _pose_of(frame.rig_from_world), tuple(sorted(taken)))
 
 
 def _rig_of(rig: Any) -> Rig:
