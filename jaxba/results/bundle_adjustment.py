@@ -22,6 +22,7 @@ from jaxba.problem.checks import shown
 from jaxba.problem.similarity import Similarity, transformed
 from jaxba.results.bundle_summary import BundleAdjustmentSummary
 from jaxba.results.retriangulate import retriangulate
+from jaxba.runtime.process import single_blas_thread
 from jaxba.solver.drivers import Callback
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import Solution, solve
@@ -113,6 +114,7 @@ class BundleAdjuster:
     priors: tuple[tuple[Any, Any], ...] = ()
     """Options of pose priors, and these, if there are any."""
 
+    @single_blas_thread()  # with two threads the gauge of a local adjustment took 30 ms beside a busy process
     def solve(self) -> BundleAdjustmentSummary:
         """Optimises the reconstruction in place. Raises: as `bundle_adjustment`."""
         check_reconstruction(self.reconstruction)
@@ -168,7 +170,7 @@ def _delete_views_behind(reconstruction: Any) -> None:
     gone = points - reconstruction.num_points3D()
     lost = f", and {gone} points that then had fewer than two" if gone else ""
     text = f"the reconstruction: deleted {deleted} views of points behind their image{lost}"
-    warnings.warn(f"{text}, as COLMAP does", ProblemWarning, stacklevel=4)
+    warnings.warn(f"{text}, as COLMAP does", ProblemWarning, stacklevel=5)
 
 
 def _transform(reconstruction: Any, by: Similarity) -> None:
@@ -194,7 +196,7 @@ def solve_options(options: Any) -> SolveOptions:
     unused = ignored(options)
     if unused:
         text = f"options: ignored {', '.join(unused)}, so that COLMAP may end elsewhere"
-        warnings.warn(text, ProblemWarning, stacklevel=4)
+        warnings.warn(text, ProblemWarning, stacklevel=5)
     group = ceres_options(options)
     solver = group.solver_options
     tolerances = {own: getattr(solver, name) for name, own in TOLERANCES.items() if changed(options, name)}
