@@ -34,7 +34,8 @@ def from_pycolmap(reconstruction: Any, config: Any = None, options: Any = None) 
     Args:
         reconstruction: read as `read_colmap` reads its files.
         config: a `pycolmap.BundleAdjustmentConfig`: images, variable and constant points, constant poses, lenses and
-            sensors, and the gauge. None: all images, and a free gauge.
+            sensors, and the gauge; the problem then holds what is seen of these alone. None: all images and points, and
+            a free gauge.
         options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values, of which the `refine_` and
             `constant_` options and `min_track_length` count here, and the rest for `jaxba.bundle_adjustment`. None:
             COLMAP's defaults.

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jaxba
+from jaxba.results.bundle_adjustment import solve_options
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
@@ -237,6 +238,16 @@ def test_a_token_stops_the_solve_in_the_third_place_and_by_name(start):
     assert stopped.termination_type == TYPES.NO_CONVERGENCE
     with pytest.raises(ValueError, match=r"config must be a pycolmap\.BundleAdjustmentConfig, not 'all'"):
         jaxba.bundle_adjustment(copy.deepcopy(start), quiet(), "all")
+
+
+def test_the_limits_of_colmaps_mapper_count(start):
+    local = pycolmap.IncrementalPipelineOptions().get_local_bundle_adjustment()
+    chosen = solve_options(local)
+    assert chosen.tolerances.gtol == local.ceres.solver_options.gradient_tolerance == 10.0
+    assert chosen.max_iterations == local.ceres.solver_options.max_num_iterations == 25
+    summary = jaxba.bundle_adjustment(copy.deepcopy(start), quiet(gradient_tolerance=1e9))
+    assert summary.termination == jaxba.Termination.GRADIENT
+    assert summary.iterations == 1
 
 
 def test_a_time_limit_ends_the_solve(start, monkeypatch):

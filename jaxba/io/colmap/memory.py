@@ -47,20 +47,16 @@ def read_part(reconstruction: Any, images: Iterable[int], points: Iterable[int],
         min_track: length of the shortest track of a point that counts.
 
     Raises ProblemError: as `check_model`."""
-    points, unit_camera = list(points), _unit_camera()
-    keys = {number: _keys_of(image, unit_camera) for number, image in _registered(reconstruction, images).items()}
+    points = list(points)
+    keys = _keys_of_images(reconstruction, images)
     keys |= _other_keys(reconstruction, points, keys)
-    named = np.concatenate([np.array(points, np.uint64), *(of["point"] for of in keys.values())])
-    heads = _points(reconstruction, np.unique(named))
-    short = heads["id"][heads["length"] < min_track]
-    for of in keys.values() if len(short) else ():
-        of["point"][np.isin(of["point"], short)] = NO_POINT
-    return _model(reconstruction, keys, heads[heads["length"] >= min_track])
+    return _with_points(reconstruction, keys, points, min_track)
 
 
 def read_whole(reconstruction: Any, min_track: int = 0) -> Model:
     """The model of all registered images and all points. Arguments and errors as for `read_part`."""
-    return read_part(reconstruction, reconstruction.reg_image_ids(), reconstruction.point3D_ids(), min_track)
+    keys = _keys_of_images(reconstruction, reconstruction.reg_image_ids())
+    return _with_points(reconstruction, keys, list(reconstruction.point3D_ids()), min_track)
 
 
 def read_records(reconstruction: Any, images: Iterable[int]) -> Model:
@@ -94,27 +90,26 @@ def write_records(reconstruction: Any, old: Model, new: Model) -> None:
             reconstruction.frame(number).rig_from_world = pose
 
 
-def _unit_camera() -> Any:
-    """A camera whose pixels are its rays."""
-    import pycolmap
-
-    return pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
-
-
 def _registered(reconstruction: Any, images: Iterable[int]) -> dict[int, Any]:
     """Those of some images that have a pose, by id."""
     of_ids = {number: reconstruction.image(number) for number in sorted(images)}
     return {number: image for number, image in of_ids.items() if image.has_pose}
 
 
-def _keys_of(image: Any, unit_camera: Any) -> Keys:
-    """The key-points of an image that see a point. The camera gives all pixels at once, as they are."""
-    keys = _no_keys(image)
-    seen = image.get_observation_points2D()
-    if len(seen):
-        at = image.get_observation_point2D_idxs()
-        keys["xy"][at] = unit_camera.cam_from_img(seen)
-        keys["point"][at] = np.array([key.point3D_id for key in seen], np.uint64)
+def _keys_of_images(reconstruction: Any, images: Iterable[int]) -> dict[int, Keys]:
+    """The key-points of registered images that see a point, by their images."""
+    import pycolmap
+
+    # its rays are the pixels, which come in one array from it
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
+    keys = {}
+    for number, image in _registered(reconstruction, images).items():
+        keys[number] = of_image = _no_keys(image)
+        seen = image.get_observation_points2D()
+        if len(seen):
+            at = image.get_observation_point2D_idxs()
+            of_image["xy"][at] = camera.cam_from_img(seen)
+            of_image["point"][at] = np.array([key.point3D_id for key in seen], np.uint64)
     return keys
 
 
@@ -142,6 +137,17 @@ def _other_keys(reconstruction: Any, points: Iterable[int], known: dict[int, Key
                 keys[at] = (key.xy, point)
                 others[number] = keys
     return others
+
+
+def _with_points(reconstruction: Any, keys: dict[int, Keys], points: list[int], min_track: int) -> Model:
+    """The model of images with key-points, of the points of these, and of other points; those of short tracks are left
+    out."""
+    seen = [of["point"][of["point"] != NO_POINT] for of in keys.values()]
+    heads = _points(reconstruction, np.unique(np.concatenate([np.array(points, np.uint64), *seen])))
+    short = heads["id"][heads["length"] < min_track]
+    for of_image in keys.values() if len(short) else ():
+        of_image["point"][np.isin(of_image["point"], short)] = NO_POINT
+    return _model(reconstruction, keys, heads[heads["length"] >= min_track])
 
 
 def _points(reconstruction: Any, ids: Shaped[np.ndarray, " ids"]) -> Shaped[np.ndarray, " points"]:
