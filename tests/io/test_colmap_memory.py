@@ -235,6 +235,15 @@ def test_a_part_is_updated_as_files_are_and_the_rest_stays(kind, tmp_path):
     assert {key for key in changed if key[0] == "frame"} == may
 
 
+def test_names_that_are_no_text_are_as_in_files(tmp_path):
+    scene(1, 1, 3, points=20).write_text(tmp_path)
+    file = tmp_path / "images.txt"
+    file.write_bytes(file.read_bytes().replace(b"frame000001", b"fr\xe4me"))
+    problem = jaxba.from_pycolmap(pycolmap.Reconstruction(tmp_path))
+    assert problem.labels.names == jaxba.read_colmap(tmp_path).labels.names
+    assert "fr\udce4me" in problem.labels.names[1]
+
+
 def test_only_what_the_part_needs_is_read():
     reconstruction = with_short_tracks(scene(1, 1, 12))
     model = read_part(reconstruction, [1, 2], [3])

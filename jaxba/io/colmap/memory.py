@@ -182,7 +182,10 @@ def _model(reconstruction: Any, keys: dict[int, Keys], points: Shaped[np.ndarray
 
 
 def _name_of(image: Any) -> bytes:
-    return image.name.encode("utf-8", "surrogateescape")
+    try:
+        return image.name.encode()
+    except UnicodeDecodeError as error:  # pycolmap gives names as text, in which not every name of a file can be
+        return error.object
 
 
 def _pose_of(rigid: Any) -> Pose:
