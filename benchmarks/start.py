@@ -33,9 +33,9 @@ from benchmarks.metrics import Metric, to_json
 from benchmarks.padding import windows
 from jaxba import BundleProblem, read_problem, write_bal
 from jaxba.bench.run import machine
-from jaxba.cli.common import CACHE_VARIABLE
 from jaxba.runtime.background import LOCK
 from jaxba.runtime.process import threads
+from jaxba.runtime.program_cache import VARIABLE as CACHE_VARIABLE
 from jaxba.solver.options import MAX_ITERATIONS
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
     from jaxba.results.graduated import solve_graduated
     from jaxba.results.retriangulate import Retriangulation, retriangulate
+    from jaxba.runtime.program_cache import keep_programs
     from jaxba.solver.many import solve_many
     from jaxba.solver.recipes import solve_recipes
     from jaxba.training.api import make_env, train
@@ -106,6 +107,7 @@ _LATE = {
     "results.derivatives": ("SolveInputs", "differentiable_solve", "inputs_of"),
     "results.graduated": ("solve_graduated",),
     "results.retriangulate": ("Retriangulation", "retriangulate"),
+    "runtime.program_cache": ("keep_programs",),
     "solver.many": ("solve_many",),
     "solver.recipes": ("solve_recipes",),
     "training.api": ("make_env", "train"),
@@ -173,6 +175,7 @@ __all__ = [
     "hold",
     "initial_state",
     "inputs_of",
+    "keep_programs",
     "lm_step",
     "load_policy",
     "make_env",

@@ -6,12 +6,10 @@ import errno
 import gc
 import importlib
 import os
-import re
 import shlex
 import signal
 import stat
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,8 +25,6 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 MISFIT = 3
 """Exit status of `jaxba-solve --strict` where a solution was written, and what was measured does not fit it."""
-
-CACHE_VARIABLE = "JAXBA_CACHE"  # environment variable with the folder of compiled programs; `off` disables the cache
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
@@ -157,53 +153,17 @@ def exit_with(status: int) -> NoReturn:
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Keeps freed memory, loads LAPACK, and enables the cache of programs; `untraced`: see `use_compilation_cache`."""
+    """Keeps freed memory, loads LAPACK, and keeps compiled programs: if `untraced` those that are compiled in parallel,
+    which are found without tracing them (`keep_programs`), otherwise all of them, by JAX's own cache."""
     from jaxba.runtime import process
+    from jaxba.runtime.program_cache import keep_programs, keep_programs_by_jax
 
     process.keep_memory()
-    use_compilation_cache(untraced)
-    process.load_lapack()
-
-
-def use_compilation_cache(untraced: bool = False) -> None:
-    """Keeps compiled programs in the user's cache folder, so that the next run starts faster: if `untraced` by
-    `runtime/executable_cache.py`, which finds programs without tracing them, but only those that are compiled in
-    parallel; otherwise by JAX's own cache, which excludes the other."""
-    import jax
-
-    from jaxba.runtime.compilation import use_cache
-    from jaxba.runtime.distrust import programs_folder
-    from jaxba.runtime.process import user_cache
-
-    choice = os.environ.get(CACHE_VARIABLE, "")
-    if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
-        return
-    try:
-        folder = programs_folder(Path(choice) if choice else user_cache("xla"))
-    except OSError:
-        return  # without a writable cache folder the command only takes longer
     if untraced:
-        use_cache(folder)
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    _remove_damaged_programs(folder)
-
-
-def _remove_damaged_programs(folder: Path) -> None:
-    """From now on removes cached programs that JAX cannot read: it neither replaces them nor stops to warn of them.
-
-    A process that is killed while it writes one, or a full disk, leaves a part of it (JAX 0.12)."""
-    shown = warnings.showwarning
-
-    def show(message: Warning | str, *where: Any, **named: Any) -> None:
-        damaged = re.match(r"Error reading persistent compilation cache entry for '([\w.-]+)'", str(message))
-        if damaged is None:
-            return shown(message, *where, **named)
-        for entry in folder.glob(f"{damaged[1]}-*"):
-            entry.unlink(missing_ok=True)
-
-    warnings.showwarning = show
+        keep_programs()
+    else:
+        keep_programs_by_jax()
+    process.load_lapack()
 
 
 def check_extra(module: str) -> None:

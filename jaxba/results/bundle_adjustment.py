@@ -23,6 +23,7 @@ from jaxba.problem.similarity import Similarity, transformed
 from jaxba.results.bundle_summary import BundleAdjustmentSummary
 from jaxba.results.retriangulate import retriangulate
 from jaxba.runtime.process import single_blas_thread
+from jaxba.runtime.program_cache import keep_programs_by_default
 from jaxba.solver.drivers import Callback
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import Solution, solve
@@ -51,6 +52,9 @@ def bundle_adjustment(
     Without a config, views of points behind their image are first deleted from the reconstruction, and points that then
     have fewer than two, as COLMAP does (`FilterObservationsWithNegativeDepth`); a `ProblemWarning` says how many. With
     one they stay, and count for nothing.
+
+    Compiled programs are kept on disk, unless `jaxba.keep_programs` or the environment variable JAXBA_CACHE says
+    otherwise.
 
     Args:
         reconstruction: start and result.
@@ -118,6 +122,7 @@ class BundleAdjuster:
     def solve(self) -> BundleAdjustmentSummary:
         """Optimises the reconstruction in place. Raises: as `bundle_adjustment`."""
         check_reconstruction(self.reconstruction)
+        keep_programs_by_default()
         options = options_of(self.options)
         chosen = solve_options(options)
         limit = TimeLimit(chosen)

@@ -4,7 +4,8 @@ JAX's own compilation cache needs a program's text, which takes tracing and lowe
 compilation where every program is cached. Here the key is what the text follows from: the function, the types of its
 arguments, its static arguments, this package's source, and JAX; `distrust.programs_folder` has a folder for each kind
 of processor and jaxlib. A file has one line of JSON with the types of the results, and the executable as XLA writes and
-reads it; nothing else in it is ever run."""
+reads it; nothing else in it is ever run. It is compressed by lzma: in a process that imports pycolmap before zlib, zlib
+of Python crashes (pycolmap 4.2 brings its own)."""
 
 from __future__ import annotations
 
@@ -14,10 +15,10 @@ import functools
 import hashlib
 import importlib
 import json
+import lzma
 import os
 import threading
 import types
-import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -35,7 +36,7 @@ from jaxba.runtime.atomic import atomic_write
 SUFFIX = ".jaxba-program"
 
 LIMIT = 1 << 30  # bytes that a folder's programs may have; the least recently used are removed first
-IN_MEMORY = 16  # programs read from disk that a process keeps: a solve has six
+IN_MEMORY = 128  # programs read from disk that a process keeps: a solve has seven, and a mapper's adjuster many sizes
 PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")  # settings of JAX that change no program
 
 
@@ -98,7 +99,8 @@ class ExecutableCache:
             if len(executable.get_parameter_layouts()) != len(jax.tree.leaves(compiled.args_info)):
                 return  # it has constants that are not in its text
             header = json.dumps(_to_json(out)).encode()
-            content = zlib.compress(header + b"\n" + executable.client.serialize_executable(executable), 1)
+            code = executable.client.serialize_executable(executable)
+            content = lzma.compress(header + b"\n" + code, preset=0)
         except Exception:  # one that calls Python, for instance, exists in its process alone
             return
         with contextlib.suppress(OSError):
@@ -144,7 +146,7 @@ _readers = ThreadPoolExecutor(max_workers=2)  # read programs, XLA each in 0.1 s
 
 @functools.lru_cache(maxsize=IN_MEMORY)
 def _load(path: Path) -> CachedExecutable:
-    header, _, code = zlib.decompress(path.read_bytes()).partition(b"\n")
+    header, _, code = lzma.decompress(path.read_bytes()).partition(b"\n")
     out = _from_json(json.loads(header))
     process.register_lapack()
     device = jax.devices()[0]
@@ -158,6 +160,9 @@ def _load(path: Path) -> CachedExecutable:
         return jax.tree.unflatten(jax.tree.structure(out), arrays)
 
     return CachedExecutable(run, out, path)
+
+
+process.when_released(_load.cache_clear)
 
 
 def _to_json(out: Any) -> Any:

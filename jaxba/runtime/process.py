@@ -111,9 +111,19 @@ def release_programs(share: float | None = None) -> bool:
     import jax
 
     jax.clear_caches()
+    for drop in _droppers:
+        drop()
     gc.collect()
     _mappings_left = _mappings()
     return True
+
+
+_droppers: list[Callable[[], object]] = []
+
+
+def when_released(drop: Callable[[], object]) -> None:
+    """Calls a function whenever `release_programs` drops programs, so that others are dropped, too."""
+    _droppers.append(drop)
 
 
 def _mappings() -> int:

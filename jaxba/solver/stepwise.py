@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import jax
@@ -40,8 +42,10 @@ from jaxba.solver.iteration import Carry, advance, begin, problem_info
 from jaxba.structure.layout import Layout, num_partitions
 
 WORTH_S = 0.3
-"""Seconds of quickly compiled iterations from which on better programs are compiled for later calls, which spares them
-three quarters of it."""
+"""Seconds of quickly compiled iterations, of all solves of a process together, from which on better programs are
+compiled for later calls, which spares them three quarters of it."""
+
+_quick_seconds: defaultdict[Path, float] = defaultdict(float)  # of programs that were not fully optimised, by files
 
 NEVER = sys.maxsize  # iterations before a step is fully optimised, if it never is
 
@@ -95,8 +99,14 @@ class Stepwise(Driver):
 
     def end(self) -> None:
         """See `Driver`."""
-        if self._quick_s > WORTH_S and (wanted := [one for one in self._wanted if not one.path.exists()]):
-            compile_later(wanted)
+        wanted = [each for each in self._wanted if not each.path.exists()]
+        for each in wanted:
+            _quick_seconds[each.path] += self._quick_s
+        worth = [each for each in wanted if _quick_seconds[each.path] > WORTH_S]
+        for each in worth:
+            del _quick_seconds[each.path]  # where another process is at it already, later solves ask again
+        if worth:
+            compile_later(worth)
 
     def _part(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, ...]:
         """The program of a part of the step at its level, and its arguments. A fully optimised one that is on disk is

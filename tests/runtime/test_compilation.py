@@ -120,7 +120,7 @@ def test_candidates_one_by_one_are_those_of_the_loop(level):
             step = proposal.step._replace(cameras=length * proposal.step.cameras, points=length * proposal.step.points)
             given = (layout, state, jax.numpy.asarray(damping), proposal._replace(step=step), options)
             call = lambda function, *arguments: function(*arguments)
-            part = lambda function: program(function, "options", level=level)
+            part = lambda function, *arguments: (program(function, "options", level=level), *arguments)
             parts = try_step_by_parts(call, part, *given, np.asarray(0.0))
             whole = jax.jit(try_step, static_argnums=4)(*given)
             chex.assert_trees_all_close(parts, whole, rtol=1e-7, atol=1e-10)

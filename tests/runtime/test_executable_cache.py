@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import lzma
 import os
 import pickle
 import subprocess
 import sys
 import time
-import zlib
 from typing import NamedTuple
 
 import chex
@@ -152,7 +152,7 @@ def test_nothing_that_is_read_can_run_code_of_its_own(folder, monkeypatch):
     file = kept(folder)[0]
     for kind in ("builtins.print", "os.system", "jaxba.solver.solve.solve"):
         header = json.dumps({"class": kind, "parts": []}).encode()
-        file.write_bytes(zlib.compress(header + b"\n", 1))
+        file.write_bytes(lzma.compress(header + b"\n"))
         forget()
         assert executable_cache.ExecutableCache(folder).load(file) is None
 
