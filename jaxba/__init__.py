@@ -83,6 +83,7 @@ if TYPE_CHECKING:
     from jaxba.results.retriangulate import Retriangulation, retriangulate
     from jaxba.runtime.program_cache import keep_programs
     from jaxba.solver.many import solve_many
+    from jaxba.solver.prepared_programs import prepare_programs
     from jaxba.solver.recipes import solve_recipes
     from jaxba.training.api import make_env, train
     from jaxba.viewer.notebook import view
@@ -109,6 +110,7 @@ _LATE = {
     "results.retriangulate": ("Retriangulation", "retriangulate"),
     "runtime.program_cache": ("keep_programs",),
     "solver.many": ("solve_many",),
+    "solver.prepared_programs": ("prepare_programs",),
     "solver.recipes": ("solve_recipes",),
     "training.api": ("make_env", "train"),
     "viewer.notebook": ("view",),
@@ -184,6 +186,7 @@ __all__ = [
     "part",
     "perturb",
     "prepare",
+    "prepare_programs",
     "random_scene",
     "random_scene_with_truth",
     "read_bal",

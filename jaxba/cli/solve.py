@@ -156,6 +156,9 @@ class Step:
     """quick: compile in a third of the time, and iterate two to six times as long. full: the contrary. auto: full once
     that pays; on a GPU always."""
 
+    prepare: bool = False
+    """Only compile, for the given problems or usual ones."""
+
 
 @options
 class Stop:
@@ -330,6 +333,8 @@ def _solve(args: Arguments) -> int:
     _check_recipes(args)
     _check_checkpoint(args)
     problems = [name for name in (args.problem, *args.more) if name]
+    if args.prepare:
+        return _prepare(args, problems, policy, options)
     if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
         from jaxba.cli import several
 
@@ -373,6 +378,31 @@ def _solve(args: Arguments) -> int:
         common.print_line(f"wrote {args.log}")
     end()
     return common.misfit_status(args.strict, len(solution.notes))
+
+
+def _prepare(args: Arguments, names: list[str], policy: DampingPolicy, options: SolveOptions) -> int:
+    """Compiles programs for some problems, or for usual ones. Raises UsageError: none are kept."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from jaxba.solver.prepared_programs import prepare_programs
+
+    problems = [_one_of_several(args, name) for name in names] or None
+    common.prepare_process(untraced=True)
+    columns = TextColumn("compiling programs"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=common.console()) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        try:
+            kinds = prepare_programs(problems, policy, options, progress=show)
+        except InputError:
+            raise
+        except ValueError as error:
+            raise common.UsageError(f"--prepare: {error}") from None
+    common.print_line(f"programs for {common.counted(kinds, 'kind')} of problems are on disk")
+    return 0
 
 
 def _is_divided(args: Arguments) -> bool:

@@ -110,15 +110,24 @@ def use_cache(folder: Path | None) -> None:
     _cache = None if folder is None else ExecutableCache(folder)
 
 
+def has_cache() -> bool:
+    """Whether `ParallelCompilation` keeps programs in a folder."""
+    return _cache is not None and not jax.config.values.get("jax_compilation_cache_dir")
+
+
 class ParallelCompilation:
     """A context in which programs are compiled in parallel, and not run; `run` then runs them without compiling.
 
     XLA compiles one program on little more than one core. The thread that leaves the context compiles what is still
     waiting; it is the one that runs the programs, so that the memory that compiling took is reused for running
     (`process.keep_memory`). The context may be entered again for more programs. A program is compiled once, for the
-    arguments that it was given first."""
+    arguments that it was given first.
 
-    def __init__(self) -> None:
+    Args:
+        ahead: whether programs that may be wanted are compiled, too, and not only read."""
+
+    def __init__(self, *, ahead: bool = False) -> None:
+        self._ahead = ahead
         self.loaded: dict[Program, CachedExecutable] = {}  # programs that were read from disk
         self._verified: set[Program] = set()  # of these, the ones that have run once
         # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
@@ -141,9 +150,9 @@ class ParallelCompilation:
         return self._results[function]
 
     def read(self, function: Program, *arguments: Any) -> None:
-        """Starts to read a program that may be wanted, if it is on disk."""
+        """Starts to read a program that may be wanted, if it is on disk; `ahead`, also to compile it."""
         path = self.path(function, *arguments)
-        if path and path.exists():
+        if self._ahead or (path and path.exists()):
             self(function, *arguments)
 
     def _begin(self, function: Program, *arguments: Any) -> Any:

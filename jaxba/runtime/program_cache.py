@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from jaxba.runtime.compilation import use_cache
+from jaxba.runtime.compilation import has_cache, use_cache
 from jaxba.runtime.distrust import programs_folder
 from jaxba.runtime.process import user_cache
 
@@ -41,6 +41,11 @@ def keep_programs_by_default() -> None:
     """`keep_programs`, unless this process has chosen already."""
     if not _is_chosen:
         keep_programs()
+
+
+def programs_are_kept() -> bool:
+    """Whether this process keeps programs on disk by `keep_programs`."""
+    return has_cache()
 
 
 def keep_programs_by_jax() -> None:

@@ -81,6 +81,12 @@ class Stepwise(Driver):
             self._compile_s = time.perf_counter() - began - self._programs.late_s
         return state
 
+    def compile(self) -> None:
+        """Compiles the programs of a solve, also those that it may do without, and runs none."""
+        with ParallelCompilation(ahead=True) as compile_programs:
+            state = self.setup.initial(compile_programs)
+            self._iterate(compile_programs, self._begin(compile_programs, state))
+
     def iterate(self) -> tuple[StepInfo, Termination]:
         """One iteration: its record, of Python scalars, and whether it ended the solve."""
         if self._done == self._first > 0:

@@ -1,0 +1,130 @@
+"""Programs compiled before they are wanted: those of problems that are given, or of usual kinds and sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxba.damping import DampingPolicy
+from jaxba.lm.termination import Tolerances
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.hold import hold
+from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.losses import Loss
+from jaxba.runtime import process
+from jaxba.runtime.compilation import CompileClock
+from jaxba.runtime.numerics import numerics
+from jaxba.runtime.program_cache import keep_programs_by_default, programs_are_kept
+from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.prepare import DEFAULT_POLICY, set_up
+from jaxba.solver.stepwise import Stepwise
+
+SIZES = (
+    *((8, slots) for slots in (2048, 4096, 6144, 8192)),
+    *((16, slots) for slots in (8192, 12288, 16384)),
+    *((32, slots) for slots in (16384, 24576, 32768)),
+    *((48, slots) for slots in (32768, 40960)),
+    *((64, slots) for slots in (40960, 49152)),
+)
+"""Cameras and slots of the grid (structure/padding.py) of problems with 250 to 1,000 observations a camera."""
+
+LOCAL_SIZES = tuple((cameras, slots) for cameras in (8, 16, 32) for slots in (6144, 8192, 12288))
+"""Those of the local adjustments of COLMAP's mapper: six free images, and all others that see their points."""
+
+TRACK = 4  # observations of a point. Real problems have 3 to 7 on average; shapes are the same for all of these
+FILLED = 0.9  # share of the slots of a size that are used
+KEPT_SHARE = 0.2  # of Linux's limit of mappings, up to which compiled programs stay: gigabytes are not needed
+MAPPER_LOSS = Loss("soft_l1", 1.0)  # of COLMAP's mapper in the first adjustments after each image
+
+
+class Kind(NamedTuple):
+    """A problem whose programs are compiled."""
+
+    problem: BundleProblem
+    loss: Loss
+
+
+def prepare_programs(
+    problems: Iterable[BundleProblem] | None = None,
+    policy: str | DampingPolicy = DEFAULT_POLICY,
+    options: SolveOptions | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Compiles programs fully, and keeps them on disk, so that no later solve waits for them.
+
+    Programs belong to a kind of problem (lenses, loss, policy) and to sizes on a coarse grid (`SolveOptions.pad`).
+
+    Args:
+        problems: those for whose kinds and sizes programs are compiled. None: usual ones, of up to 64 cameras: with own
+            lenses as in BAL's files, with one lens as in most of COLMAP's models, and those of COLMAP's mapper.
+        policy: as for `solve`.
+        options: as for `solve`. Their loss is not that of the usual problems, which have their own.
+        progress: called with the number of kinds that are done, and that of all, before the first and after each.
+
+    Returns:
+        The number of kinds.
+
+    Raises:
+        ValueError: no programs are kept (`keep_programs`), or as `solve`.
+        ProblemError: as `solve`."""
+    keep_programs_by_default()
+    if not programs_are_kept():
+        raise ValueError("no programs are kept on disk here: see jaxba.keep_programs and JAXBA_CACHE")
+    chosen = checked_options(options)
+    kinds = list(usual_kinds()) if problems is None else [Kind(problem, chosen.loss) for problem in problems]
+    for number, kind in enumerate(kinds):
+        if progress:
+            progress(number, len(kinds))
+        _compile(kind, policy, chosen)
+    if progress:
+        progress(len(kinds), len(kinds))
+    return len(kinds)
+
+
+def _compile(kind: Kind, policy: str | DampingPolicy, options: SolveOptions) -> None:
+    """Compiles the programs of a kind. They are on disk, so that this process may drop them."""
+    padded = True if options.pad is None else options.pad
+    setup = set_up(kind.problem, policy, replace(options, loss=kind.loss, pad=padded))
+    with numerics(setup.dtype), CompileClock() as clock:
+        Stepwise(0, setup, Tolerances(), options.max_iterations, clock).compile()
+    process.release_programs(KEPT_SHARE)
+
+
+def usual_kinds() -> Iterator[Kind]:
+    """The kinds that `prepare_programs` compiles without problems."""
+    for cameras, slots in SIZES:
+        yield Kind(problem_of_size(cameras, slots), Loss())
+    for cameras, slots in SIZES:
+        yield Kind(_with_one_lens(problem_of_size(cameras, slots)), Loss())
+    for cameras, slots in LOCAL_SIZES:
+        local = hold(_with_one_lens(problem_of_size(cameras, slots)), lenses="all")
+        yield Kind(local, MAPPER_LOSS)
+        yield Kind(local, Loss())
+
+
+def problem_of_size(cameras: int, slots: int) -> BundleProblem:
+    """A problem whose sizes are rounded up to these. Points lie on a plane in front of cameras side by side."""
+    points = int(FILLED * slots) // TRACK
+    rng = np.random.default_rng(0)
+    positions = np.column_stack([rng.uniform(-1, 1, (points, 2)), np.full(points, -5.0)])
+    parameters = np.zeros((cameras, 9))
+    parameters[:, 3] = np.linspace(-1, 1, cameras)  # translations
+    parameters[:, 6] = 500.0  # focal lengths, pixels
+    camera = (np.arange(points)[:, None] + np.arange(TRACK)) % cameras
+    in_camera = positions[:, None, :] + parameters[camera, 3:6]
+    pixels = -500.0 * in_camera[..., :2] / in_camera[..., 2:]
+    return BundleProblem.create(
+        parameters, positions, pixels.reshape(-1, 2), camera.ravel(), np.repeat(np.arange(points), TRACK)
+    )
+
+
+def _with_one_lens(problem: BundleProblem) -> BundleProblem:
+    """The problem with one lens of COLMAP's SIMPLE_RADIAL, and two poses constant in part, as COLMAP's gauge has it."""
+    free = np.zeros((1, LENS_SIZE), bool)
+    free[0, :2] = True  # focal length and one coefficient of distortion
+    lens = Lenses(np.zeros(problem.num_cameras, np.int32), free)
+    return hold(problem.replace(lenses=lens), poses=[0])
