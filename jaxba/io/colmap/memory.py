@@ -9,7 +9,7 @@ from collections.abc import Container, Iterable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 
 from jaxba.io.colmap.model import (
     CAMERA_SENSOR,
@@ -98,19 +98,28 @@ def _registered(reconstruction: Any, images: Iterable[int]) -> dict[int, Any]:
 
 def _keys_of_images(reconstruction: Any, images: Iterable[int]) -> dict[int, Keys]:
     """The key-points of registered images that see a point, by their images."""
-    import pycolmap
-
-    # its rays are the pixels, which come in one array from it
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
     keys = {}
     for number, image in _registered(reconstruction, images).items():
         keys[number] = of_image = _no_keys(image)
         seen = image.get_observation_points2D()
         if len(seen):
             at = image.get_observation_point2D_idxs()
-            of_image["xy"][at] = camera.cam_from_img(seen)
-            of_image["point"][at] = np.array([key.point3D_id for key in seen], np.uint64)
+            of_image["xy"][at] = _pixels(seen)
+            of_image["point"][at] = _points_of(seen)
     return keys
+
+
+def _pixels(keys: Any) -> Float[np.ndarray, "keys 2"]:
+    """Where key-points are, in one array: pycolmap gives those of single ones as an array each."""
+    import pycolmap
+
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
+    return np.asarray(camera.cam_from_img(keys))  # its rays are the pixels
+
+
+def _points_of(keys: Any) -> Shaped[np.ndarray, " keys"]:
+    """The ids of the points that key-points are of."""
+    return np.array([key.point3D_id for key in keys], np.uint64)
 
 
 def _no_keys(image: Any) -> Keys:
@@ -122,20 +131,25 @@ def _no_keys(image: Any) -> Keys:
 def _other_keys(reconstruction: Any, points: Iterable[int], known: dict[int, Keys]) -> dict[int, Keys]:
     """The key-points of some points in registered images of which none are known yet, by their images. One that says it
     is of another point than the track does is left out."""
-    elements: dict[int, list[tuple[int, int]]] = {}
+    import pycolmap
+
+    places: dict[int, tuple[list[int], list[int]]] = {}  # of their key-points in each image, and their points
     for point in points:
         for element in reconstruction.point3D(point).track.elements:
             image = element.image_id
             if image not in known:
-                elements.setdefault(image, []).append((element.point2D_idx, point))
+                at, of_points = places.setdefault(image, ([], []))
+                at.append(element.point2D_idx)
+                of_points.append(point)
     others = {}
-    for number, image in _registered(reconstruction, elements).items():
-        keys = _no_keys(image)
-        for at, point in elements[number]:
-            key = image.point2D(at)
-            if key.point3D_id == point:
-                keys[at] = (key.xy, point)
-                others[number] = keys
+    for number, image in _registered(reconstruction, places).items():
+        at, of_points = map(np.array, places[number])
+        seen = pycolmap.Point2DList([image.point2D(k) for k in at.tolist()])
+        agrees = _points_of(seen) == of_points.astype(np.uint64)
+        if agrees.any():
+            others[number] = of_image = _no_keys(image)
+            of_image["xy"][at[agrees]] = _pixels(seen)[agrees]
+            of_image["point"][at[agrees]] = of_points[agrees]
     return others
 
 
