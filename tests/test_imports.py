@@ -19,8 +19,20 @@ from conftest import LABORATORY
 import jaxba
 
 ORDER = (
-    *("typing", "runtime", "rotations", "problem", "residuals", "io", "settings", "structure", "model", "linear"),
-    *("refinement", "lm", "damping", "solver", "results", "constraints", "scenes", "datasets", "viewer", "jaxba"),
+    *(
+        "typing",
+        "runtime",
+        "rotations",
+        "problem",
+        "residuals",
+        "io",
+        "settings",
+        "scenes",
+        "structure",
+        "model",
+        "linear",
+    ),
+    *("refinement", "lm", "damping", "solver", "results", "constraints", "datasets", "viewer", "jaxba"),
     *("methods", "kitti", "game", "training", "peers", "bench", "paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""

@@ -177,7 +177,7 @@ def set_up(
         shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
         if parts > 1:
             process.return_memory()
-        grid = not given  # else a shape would depend on more than the capacity
+        grid = capacity is None  # else a shape would depend on more than the capacity
         layout = shards.first if shards else build_layout(here, step, capacity, observations, grid=grid)
         layout = layout if shards or given else jax.device_put(layout)
         start = (here.cameras, here.points) if capacity is None else padded_parameters(here, capacity)

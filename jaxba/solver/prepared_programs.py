@@ -18,24 +18,28 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.numerics import numerics
 from jaxba.runtime.program_cache import keep_programs_by_default, programs_are_kept
+from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, set_up
 from jaxba.solver.stepwise import Stepwise
 
 SIZES = (
-    *((8, slots) for slots in (2048, 4096, 6144, 8192)),
-    *((16, slots) for slots in (8192, 12288, 16384)),
-    *((32, slots) for slots in (16384, 24576, 32768)),
+    *((8, slots) for slots in (2048, 3072, 4096, 6144, 8192)),
+    *((16, slots) for slots in (8192, 12288, 16384, 20480)),
+    *((32, slots) for slots in (16384, 20480, 24576, 28672, 32768)),
     *((48, slots) for slots in (32768, 40960)),
     *((64, slots) for slots in (40960, 49152)),
 )
 """Cameras and slots of the grid (structure/padding.py) of problems with 250 to 1,000 observations a camera."""
 
+FEWEST = SIZES[0][0]  # cameras up to which a mapper adjusts all of them by its loss for local adjustments
+
 LOCAL_SIZES = tuple((cameras, slots) for cameras in (8, 16, 32) for slots in (6144, 8192, 12288))
 """Those of the local adjustments of COLMAP's mapper: six free images, and all others that see their points."""
 
-TRACK = 4  # observations of a point. Real problems have 3 to 7 on average; shapes are the same for all of these
-FILLED = 0.9  # share of the slots of a size that are used
+FILLED = 0.84  # observations of a scene for each slot of its size; others are half of a chunk, or empty
+TRACK = 4.3  # observations of a point, as in BAL's problems and in those of COLMAP on KITTI
+FREE = 6  # images that a local adjustment of COLMAP optimises
 KEPT_SHARE = 0.2  # of Linux's limit of mappings, up to which compiled programs stay: gigabytes are not needed
 MAPPER_LOSS = Loss("soft_l1", 1.0)  # of COLMAP's mapper in the first adjustments after each image
 
@@ -99,27 +103,32 @@ def usual_kinds() -> Iterator[Kind]:
     for cameras, slots in SIZES:
         yield Kind(problem_of_size(cameras, slots), Loss())
     for cameras, slots in SIZES:
-        yield Kind(_with_one_lens(problem_of_size(cameras, slots)), Loss())
+        problem = _with_one_lens(problem_of_size(cameras, slots))
+        yield Kind(problem, Loss())
+        yield Kind(_seen_twice(problem), Loss())
+        if cameras == FEWEST:
+            yield Kind(problem, MAPPER_LOSS)
     for cameras, slots in LOCAL_SIZES:
-        local = hold(_with_one_lens(problem_of_size(cameras, slots)), lenses="all")
+        local = _local(_with_one_lens(problem_of_size(cameras, slots)))
         yield Kind(local, MAPPER_LOSS)
         yield Kind(local, Loss())
 
 
 def problem_of_size(cameras: int, slots: int) -> BundleProblem:
-    """A problem whose sizes are rounded up to these. Points lie on a plane in front of cameras side by side."""
-    points = int(FILLED * slots) // TRACK
-    rng = np.random.default_rng(0)
-    positions = np.column_stack([rng.uniform(-1, 1, (points, 2)), np.full(points, -5.0)])
-    parameters = np.zeros((cameras, 9))
-    parameters[:, 3] = np.linspace(-1, 1, cameras)  # translations
-    parameters[:, 6] = 500.0  # focal lengths, pixels
-    camera = (np.arange(points)[:, None] + np.arange(TRACK)) % cameras
-    in_camera = positions[:, None, :] + parameters[camera, 3:6]
-    pixels = -500.0 * in_camera[..., :2] / in_camera[..., 2:]
-    return BundleProblem.create(
-        parameters, positions, pixels.reshape(-1, 2), camera.ravel(), np.repeat(np.arange(points), TRACK)
-    )
+    """A random scene whose sizes are rounded up to these."""
+    observations = int(FILLED * slots)
+    return random_scene(SceneConfig(cameras, int(observations / TRACK), observations), 0)
+
+
+def _local(problem: BundleProblem) -> BundleProblem:
+    """The problem with constant lenses, and poses of which the last ones are free."""
+    constant = np.arange(max(1, problem.num_cameras - FREE))
+    return hold(problem, lenses="all", poses=constant)
+
+
+def _seen_twice(problem: BundleProblem) -> BundleProblem:
+    """The problem with a view of a point that is there twice, as most of COLMAP's models have some."""
+    return problem.subset(np.append(0, np.arange(problem.num_observations)))
 
 
 def _with_one_lens(problem: BundleProblem) -> BundleProblem:

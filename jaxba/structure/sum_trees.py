@@ -85,7 +85,14 @@ PREFIX_SHARES = (  # most targets that have an item of a rank, relative to all i
 
 
 def prefix_levels(
-    items: np.ndarray, counts: np.ndarray, empty: int, room: Room, first: int = 0, *, loosest: bool = False
+    items: np.ndarray,
+    counts: np.ndarray,
+    empty: int,
+    room: Room,
+    first: int = 0,
+    *,
+    tightest: int = 0,
+    loosest: bool = False,
 ) -> tuple[Int[np.ndarray, "_ _"], ...]:
     """Index arrays that sum the items of targets with descending counts: rank by rank, over prefixes of the targets.
 
@@ -99,6 +106,7 @@ def prefix_levels(
         empty: index of a row of zeros, for padding.
         room: bounds from which the shapes follow, together with the number of targets.
         first: first rank that is listed. Rank 0 is listed for all targets.
+        tightest: number of the first of `PREFIX_SHARES` that is tried.
         loosest: whether it is the last one in any case."""
     if len(items) > room.items or counts.max(initial=0) > room.most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
@@ -107,7 +115,7 @@ def prefix_levels(
         ranks.append(max(1, 2 * ranks[-1]))
     begins, ends = ranks[:-1], ranks[1:]
     present = [np.count_nonzero(counts > rank) for rank in begins]
-    for share in PREFIX_SHARES[-1:] if loosest else PREFIX_SHARES:
+    for share in PREFIX_SHARES[-1:] if loosest else PREFIX_SHARES[tightest:]:
         lengths = [min(len(counts), int(room.items * share(rank))) if rank else len(counts) for rank in begins]
         if all(n <= length for n, length in zip(present, lengths, strict=True)):
             break
