@@ -79,7 +79,18 @@ def workplace(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name_of)
+SLOW = {"docs/how-to/residuals.md", "docs/reference/api/residuals.md"}
+"""Pages whose code takes longest: it solves problems of several kinds."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
+        for page in PAGES
+        if blocks(page, "python")
+    ],
+)
 def test_the_code_of_a_page_runs_from_top_to_bottom(page, workplace):
     names: dict[str, object] = {"__name__": "__main__"}
     try:

@@ -177,6 +177,7 @@ def test_control_points_alone_move_the_scene_to_them(block, tmp_path):
 
 
 @pytest.mark.extra
+@pytest.mark.slow
 def test_positions_give_the_scene_that_they_give_colmap(block, tmp_path):
     pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
     (tmp_path / "c.yaml").write_text(f"position_priors: {{file: {block.folder}/log.csv}}")

@@ -34,7 +34,7 @@ KINDS = {
     "free places, a scale bar": 21,
     "no rigs, a constant pose": 3,
 }
-SLOW = ("free places, priors of positions", "constant places, surveyed points")
+SLOW = ("free places, priors of positions", "constant places, surveyed points", "free places, a scale bar")
 
 
 @functools.partial(jax.jit, compiler_options=compiler_options("quick"))

@@ -51,8 +51,8 @@ CASES = [
     *(pytest.param(make, EXACT, id=name) for name, make in PROBLEMS.items()),
     pytest.param(support.tiny, replace(EXACT, intrinsics="fixed"), id="tiny-fixed-intrinsics"),
     pytest.param(support.odd, TO_THE_END, id="odd-implicit"),
-    pytest.param(support.odd, SOLVERS["sparse"], id="odd-sparse"),
-    pytest.param(support.odd, SOLVERS["cg"], id="odd-cg"),
+    pytest.param(support.odd, SOLVERS["sparse"], id="odd-sparse", marks=pytest.mark.slow),
+    pytest.param(support.odd, SOLVERS["cg"], id="odd-cg", marks=pytest.mark.slow),
     pytest.param(support.whitened, EXACT, id="whitened"),
     pytest.param(support.whitened, replace(TO_THE_END, loss=Loss("cauchy", 0.8)), id="whitened-implicit-cauchy"),
     *(

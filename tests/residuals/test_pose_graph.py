@@ -52,6 +52,7 @@ def test_a_pose_graph_has_covariances():
     assert np.isfinite(jaxba.covariance(held_graph()).poses).all()
 
 
+@pytest.mark.slow
 def test_a_pose_graph_ends_where_scipy_does():
     poses, pairs, measured = graph()
     problem = held_graph()
