@@ -1,4 +1,5 @@
-"""Puts copies of `configs/` into the wheel, where an installed jaxba finds them. All else is in pyproject.toml."""
+"""Puts copies of `configs/` into the wheel, where an installed jaxba finds them. All else is in
+pyproject.toml."""
 
 from pathlib import Path
 

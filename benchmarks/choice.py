@@ -1,12 +1,14 @@
-"""Times of the linear solvers, compared with the predictions of the cost model (`solver/choose.py`).
+"""Times of the linear solvers, compared with the predictions of the cost model
+(`solver/choose.py`).
 
-    python -m benchmarks.choice [PROBLEM ...] [--solver ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
+    python -m benchmarks.choice [PROBLEM ...] [--solver ceres+refine3] [--iterations 6] [--repeats
+    5] [--fit]
 
-A problem is a file or a random scene (`scene:random-150`). Default: those in `JAXBA_DATA` and two random scenes. For
-each linear solver, the whole loop is one compiled program; the solvers are timed alternately. `loss` is the time of the
-solver that `auto` chooses over that of the fastest. `--fit` prints the constants of the cost model that fit these times
-best, with the counted number of products in conjugate gradients.
-"""
+A problem is a file or a random scene (`scene:random-150`). Default: those in `JAXBA_DATA` and two
+random scenes. For each linear solver, the whole loop is one compiled program; the solvers are timed
+alternately. `loss` is the time of the solver that `auto` chooses over that of the fastest. `--fit`
+prints the constants of the cost model that fit these times best, with the counted number of
+products in conjugate gradients."""
 
 from __future__ import annotations
 
@@ -36,8 +38,8 @@ class Timed(NamedTuple):
 
 
 def measure(problem: BundleProblem, solver: str, iterations: int, repeats: int) -> dict[str, Timed]:
-    """Median time of an iteration with each linear solver that fits into memory, timed alternately. The first round
-    compiles and is not counted."""
+    """Median time of an iteration with each linear solver that fits into memory, timed alternately.
+    The first round compiles and is not counted."""
     spent: dict[str, list[float]] = {name: [] for name in work(problem)}
     products = {}
     for repeat in range(repeats + 1):
@@ -58,7 +60,11 @@ def fit(done: list[tuple[Work, float]]) -> Work:
     """The non-negative constants with the least sum of squared relative errors."""
     taken = np.array([each for _, each in done])
     unit = np.array(list(SECONDS.values()))
-    amounts = np.array([[amounts.get(kind, 0.0) for kind in SECONDS] for amounts, _ in done]) * unit / taken[:, None]
+    amounts = (
+        np.array([[amounts.get(kind, 0.0) for kind in SECONDS] for amounts, _ in done])
+        * unit
+        / taken[:, None]
+    )
     found, _ = nnls(amounts, np.ones(len(done)))
     return dict(zip(SECONDS, (found * unit).tolist(), strict=True))
 
@@ -86,7 +92,10 @@ def main() -> None:
             amounts = work(problem, time.products)[name]
             done.append((amounts, time.seconds))
             mark = "*" if name == taken else ""
-            cells.append(f"{mark}{name} {1e3 * time.seconds:.2f} ({1e3 * seconds(amounts):.2f}, {time.products:.1f})")
+            cells.append(
+                f"{mark}{name} {1e3 * time.seconds:.2f} ({1e3 * seconds(amounts):.2f}, "
+                f"{time.products:.1f})"
+            )
         print(f"{source.name}: {'; '.join(cells)}: {losses[-1]:.2f}", flush=True)
     print(f"loss: geometric mean {np.exp(np.mean(np.log(losses))):.3f}, largest {max(losses):.2f}")
     if args.fit:

@@ -1,11 +1,12 @@
-"""Costs beside COLMAP's own on reconstructions that COLMAP makes up: every camera model, what is free, who shares.
+"""Costs beside COLMAP's own on reconstructions that COLMAP makes up: every camera model, what is
+free, who shares.
 
     python -m benchmarks.colmap_models [--models OPENCV,FOV] [--seed 0] [--frames 12] [--points 80]
 
-Needs the extra `ceres`. For every model, free numbers (focal length; and distortion; and principal point) and sharing
-(a lens each, one for all, two) the initial and the final cost over COLMAP's, less one. Then constants, both gauges,
-position priors, and rigs of three cameras with free and constant extrinsics. Nothing is written.
-"""
+Needs the extra `ceres`. For every model, free numbers (focal length; and distortion; and principal
+point) and sharing (a lens each, one for all, two) the initial and the final cost over COLMAP's,
+less one. Then constants, both gauges, position priors, and rigs of three cameras with free and
+constant extrinsics. Nothing is written."""
 
 from __future__ import annotations
 
@@ -29,21 +30,42 @@ FREE = {
 }
 SIZE = 640, 480
 TIGHT = jaxba.SolveOptions(
-    tolerances=jaxba.Tolerances(ftol=1e-13, xtol=1e-13), max_iterations=300, linear_solver="explicit"
+    tolerances=jaxba.Tolerances(ftol=1e-13, xtol=1e-13),
+    max_iterations=300,
+    linear_solver="explicit",
 )
 PRIOR_SIGMA = 0.05
-START = {"omega": 0.5, "alpha": 0.5, "beta": 1.0, "f": 500.0, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
+START = {
+    "omega": 0.5,
+    "alpha": 0.5,
+    "beta": 1.0,
+    "f": 500.0,
+    "fx": 500.0,
+    "fy": 500.0,
+    "cx": 320.0,
+    "cy": 240.0,
+}
 
 
-def reconstruction(kind: str, cameras: int, frames: int, points: int, seed: int, in_rig: int = 1) -> Any:
-    """A reconstruction that COLMAP makes up, with noise of half a pixel and a start that is a little off."""
+def reconstruction(
+    kind: str, cameras: int, frames: int, points: int, seed: int, in_rig: int = 1
+) -> Any:
+    """A reconstruction that COLMAP makes up, with noise of half a pixel and a start that is a
+    little off."""
     import pycolmap
 
     pycolmap.set_random_seed(seed)
     rng = np.random.default_rng(seed)
-    params = [START[name] if name in START else rng.uniform(-0.01, 0.01) for name in CAMERA_MODELS[kind].parameters]
+    params = [
+        START[name] if name in START else rng.uniform(-0.01, 0.01)
+        for name in CAMERA_MODELS[kind].parameters
+    ]
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = cameras, in_rig, frames // cameras
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
+        cameras,
+        in_rig,
+        frames // cameras,
+    )
     options.num_points3D, options.num_points2D_without_point3D = points, 0
     options.camera_width, options.camera_height = SIZE
     options.camera_model_id = getattr(pycolmap.CameraModelId, kind)
@@ -76,11 +98,17 @@ def settings(**free: bool) -> tuple[Any, Any]:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     solver = options.ceres.solver_options
     solver.max_num_iterations = 300
-    solver.function_tolerance, solver.gradient_tolerance, solver.parameter_tolerance = 1e-14, 1e-12, 1e-14
+    solver.function_tolerance, solver.gradient_tolerance, solver.parameter_tolerance = (
+        1e-14,
+        1e-12,
+        1e-14,
+    )
     return options, pycolmap.BundleAdjustmentConfig()
 
 
-def by_colmap(folder: str, change: Callable[[Any, Any], None] = lambda config, model: None, **free: bool) -> Any:
+def by_colmap(
+    folder: str, change: Callable[[Any, Any], None] = lambda config, model: None, **free: bool
+) -> Any:
     """The model after COLMAP's own bundle adjustment; `change` may change its configuration."""
     import pycolmap
 
@@ -100,7 +128,10 @@ def rows(kind: str, args: argparse.Namespace) -> Iterator[tuple[str, str, float,
             made = reconstruction(kind, cameras, args.frames, args.points, args.seed)
             made.write(folder)
             for free, options in FREE.items():
-                if options.get("refine_extra_params") is False and not CAMERA_MODELS[kind].distortion:
+                if (
+                    options.get("refine_extra_params") is False
+                    and not CAMERA_MODELS[kind].distortion
+                ):
                     continue
                 centre = options.get("refine_principal_point", False)
                 problem = jaxba.read_colmap(folder, refine_principal_point=centre)
@@ -108,7 +139,12 @@ def rows(kind: str, args: argparse.Namespace) -> Iterator[tuple[str, str, float,
                     problem = jaxba.hold(problem, numbers=["distortion"])
                 solution = jaxba.solve(problem, args.policy, TIGHT)
                 start, end = cost_of(made), cost_of(by_colmap(folder, **options))
-                yield sharing, free, geometry.cost(problem) / start - 1, solution.final_cost / end - 1
+                yield (
+                    sharing,
+                    free,
+                    geometry.cost(problem) / start - 1,
+                    solution.final_cost / end - 1,
+                )
 
 
 def constraints(args: argparse.Namespace) -> Iterator[tuple[str, float, float]]:
@@ -169,7 +205,9 @@ def _with_priors(folder: str, problem: jaxba.BundleProblem, args: argparse.Names
     rng = np.random.default_rng(args.seed)
     assert problem.labels is not None
     ids = problem.labels.images.tolist()
-    places = np.array([model.image(i).projection_center() + PRIOR_SIGMA * rng.normal(size=3) for i in ids])
+    places = np.array(
+        [model.image(i).projection_center() + PRIOR_SIGMA * rng.normal(size=3) for i in ids]
+    )
     spread = PRIOR_SIGMA**2 * np.eye(3)
     frame = pycolmap.PosePriorCoordinateSystem.CARTESIAN
     priors = [
@@ -191,13 +229,21 @@ def _with_priors(folder: str, problem: jaxba.BundleProblem, args: argparse.Names
     adjuster.solve()
     away = np.array([model.image(i).projection_center() for i in ids]) - places
     truth = cost_of(model) + 0.5 * float(np.sum(away**2)) / PRIOR_SIGMA**2
-    return jaxba.solve(with_position_priors(problem, places, spread), args.policy, TIGHT).final_cost / truth - 1
+    return (
+        jaxba.solve(with_position_priors(problem, places, spread), args.policy, TIGHT).final_cost
+        / truth
+        - 1
+    )
 
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", default=",".join(name for name in CAMERA_MODELS if CAMERA_MODELS[name].focal))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--models", default=",".join(name for name in CAMERA_MODELS if CAMERA_MODELS[name].focal)
+    )
     parser.add_argument("--policy", default="ceres")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=12)

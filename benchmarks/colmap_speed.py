@@ -1,13 +1,14 @@
 """COLMAP models solved by jaxba and by COLMAP: seconds, memory, final cost.
 
-    python -m benchmarks.colmap_speed [--images 3000] [--points 30000] [--track 5] [--compilation auto]
-    python -m benchmarks.colmap_speed --models FOLDER ... --solvers explicit,sparse,implicit,colmap
+    python -m benchmarks.colmap_speed [--images 3000] [--points 30000] [--track 5] [--compilation
+    auto] python -m benchmarks.colmap_speed --models FOLDER ... --solvers
+    explicit,sparse,implicit,colmap
 
-Without models it is a random scene whose images share one OPENCV lens. Needs the extra `ceres`. Each side is a process
-of its own; memory is its largest resident set. Both read the same COLMAP model, have a squared loss and stop at a
-relative decrease of 1e-6. Seconds of ours are those of set-up and iterations, by default in fully compiled programs;
-compilation is apart, and takes most of the memory. COLMAP uses all cores.
-"""
+Without models it is a random scene whose images share one OPENCV lens. Needs the extra `ceres`.
+Each side is a process of its own; memory is its largest resident set. Both read the same COLMAP
+model, have a squared loss and stop at a relative decrease of 1e-6. Seconds of ours are those of
+set-up and iterations, by default in fully compiled programs; compilation is apart, and takes most
+of the memory. COLMAP uses all cores."""
 
 from __future__ import annotations
 
@@ -39,11 +40,16 @@ def make(folder: str, images: int, points: int, track: float) -> None:
     start, truth = jaxba.random_scene_with_truth(config, seed=0)
     model = CAMERA_MODELS["OPENCV"]
     lenses = Lenses(
-        np.zeros(images, np.int32), np.ones((1, len(model)), bool) & ~np.isin(range(8), (2, 3)), None, (model,)
+        np.zeros(images, np.int32),
+        np.ones((1, len(model)), bool) & ~np.isin(range(8), (2, 3)),
+        None,
+        (model,),
     )
     rng = np.random.default_rng(0)
 
-    def with_lens(problem: BundleProblem, numbers: list[float], observations: np.ndarray) -> BundleProblem:
+    def with_lens(
+        problem: BundleProblem, numbers: list[float], observations: np.ndarray
+    ) -> BundleProblem:
         cameras = np.hstack([np.asarray(problem.cameras)[:, :6], np.tile(numbers, (images, 1))])
         parts = (problem.points, observations, problem.camera_index, problem.point_index)
         return BundleProblem.create(cameras, *parts, lenses=lenses)
@@ -51,7 +57,9 @@ def make(folder: str, images: int, points: int, track: float) -> None:
     true = with_lens(truth, LENS, np.zeros((truth.num_observations, 2)))
     pixels = geometry.project(true)
     pixels += 0.5 * rng.normal(size=pixels.shape)
-    jaxba.write_colmap(with_lens(start, [780.0, 780.0, 640.0, 480.0, 0.0, 0.0, 0.0, 0.0], pixels), folder)
+    jaxba.write_colmap(
+        with_lens(start, [780.0, 780.0, 640.0, 480.0, 0.0, 0.0, 0.0, 0.0], pixels), folder
+    )
 
 
 def ours(folder: str, policy: str, solver: Any, compilation: Any) -> dict[str, float | str]:
@@ -60,7 +68,9 @@ def ours(folder: str, policy: str, solver: Any, compilation: Any) -> dict[str, f
 
     problem = jaxba.read_colmap(folder)
     tolerances = jaxba.Tolerances(ftol=FTOL)
-    options = jaxba.SolveOptions(tolerances=tolerances, linear_solver=solver, compilation=compilation, pad=False)
+    options = jaxba.SolveOptions(
+        tolerances=tolerances, linear_solver=solver, compilation=compilation, pad=False
+    )
     found = jaxba.solve(problem, policy, options)
     return {
         "initial": found.initial_cost,
@@ -98,7 +108,9 @@ def colmaps(folder: str) -> dict[str, float | str]:
 
 def main() -> None:
     """Prints a line for each side."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--models", nargs="*", default=())
     parser.add_argument("--images", type=int, default=3000)
     parser.add_argument("--points", type=int, default=30_000)
@@ -110,7 +122,11 @@ def main() -> None:
     args = parser.parse_args()
     if args.side:
         side, folder = args.side
-        found = colmaps(folder) if side == "colmap" else ours(folder, args.policy, side, args.compilation)
+        found = (
+            colmaps(folder)
+            if side == "colmap"
+            else ours(folder, args.policy, side, args.compilation)
+        )
         found["memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         print(json.dumps(found))
         return
@@ -123,7 +139,12 @@ def main() -> None:
                 command += ["--policy", args.policy, "--compilation", args.compilation]
                 done = subprocess.run(command, capture_output=True, text=True)
                 name = Path(folder).name if args.models else "random scene"
-                print(name, side, done.stdout.strip() or done.stderr.strip().splitlines()[-1:], flush=True)
+                print(
+                    name,
+                    side,
+                    done.stdout.strip() or done.stderr.strip().splitlines()[-1:],
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

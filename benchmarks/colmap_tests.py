@@ -1,12 +1,13 @@
-"""COLMAP's own bundle adjustment tests, made again: `jaxba.bundle_adjustment` beside pycolmap's adjuster.
+"""COLMAP's own bundle adjustment tests, made again: `jaxba.bundle_adjustment` beside pycolmap's
+adjuster.
 
     python -m benchmarks.colmap_tests [--markdown]
 
-Each situation is a synthetic scene with noise, options and a configuration of pycolmap, given to both as they are. A
-row has the numbers of unknowns, the cost of jaxba over that of COLMAP less one with tight tolerances, and with default
-ones, and iterations with default ones. Costs are computed by pycolmap, over the observations that count, from what each
-wrote back. Source: COLMAP 4.2, `src/colmap/estimators/bundle_adjustment_test.cc`.
-"""
+Each situation is a synthetic scene with noise, options and a configuration of pycolmap, given to
+both as they are. A row has the numbers of unknowns, the cost of jaxba over that of COLMAP less one
+with tight tolerances, and with default ones, and iterations with default ones. Costs are computed
+by pycolmap, over the observations that count, from what each wrote back. Source: COLMAP 4.2,
+`src/colmap/estimators/bundle_adjustment_test.cc`."""
 
 from __future__ import annotations
 
@@ -33,24 +34,39 @@ class Situation(NamedTuple):
     why: str = ""  # why the ends may differ
 
 
-def scene(rigs: int = 10, cameras: int = 1, frames: int = 1, points: int = 100, model: str = "SIMPLE_RADIAL") -> Any:
+def scene(
+    rigs: int = 10,
+    cameras: int = 1,
+    frames: int = 1,
+    points: int = 100,
+    model: str = "SIMPLE_RADIAL",
+) -> Any:
     """A scene with noise."""
     pycolmap.set_random_seed(1)
     options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = rigs, cameras, frames
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
+        rigs,
+        cameras,
+        frames,
+    )
     options.num_points3D, options.num_points2D_without_point3D = points, 3
     options.camera_model_id = getattr(pycolmap.CameraModelId, model)
     if model == "EQUIRECTANGULAR":
         options.camera_width, options.camera_height, options.camera_params = 1000, 500, [1000, 500]
     found = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = 0.5, 0.02, 0.3
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
+        0.5,
+        0.02,
+        0.3,
+    )
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, found)
     return found
 
 
 def configured(of: Any, gauge: Any = None, images: list[int] | None = None, **more: Any) -> Any:
-    """A configuration of all images, or of some, that holds more: frames, lenses, sensors, points and variable ones."""
+    """A configuration of all images, or of some, that holds more: frames, lenses, sensors, points
+    and variable ones."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in sorted(of.images) if images is None else images:
         config.add_image(image)
@@ -73,7 +89,9 @@ def situations() -> Iterator[Situation]:
     """COLMAP's tests, by their names."""
     two, three = Gauge.TWO_CAMS_FROM_WORLD, Gauge.THREE_POINTS
 
-    def made(name: str, of: Any, why: str = "", options: dict[str, Any] | None = None, **more: Any) -> Situation:
+    def made(
+        name: str, of: Any, why: str = "", options: dict[str, Any] | None = None, **more: Any
+    ) -> Situation:
         return Situation(name, of, configured(of, **more), options or {}, why)
 
     other = "the two choose other points"
@@ -88,24 +106,58 @@ def situations() -> Iterator[Situation]:
     sensors = list(next(iter(many.rigs.values())).non_ref_sensors)
     less = "COLMAP holds one number more than is free"
     yield made("ManyViewRigConstantSensorFromRig", many, less, gauge=two, sensors=sensors)
-    yield made("ManyViewRigConstantSensorFromRig, points", many, other, gauge=three, sensors=sensors)
+    yield made(
+        "ManyViewRigConstantSensorFromRig, points", many, other, gauge=three, sensors=sensors
+    )
     yield made("ManyViewRigConstantRigFromWorld", many, other, gauge=three, frames=[1])
-    yield made("ConstantRigFromWorldRotation", scene(2), "", {"constant_rig_from_world_rotation": True}, gauge=two)
+    yield made(
+        "ConstantRigFromWorldRotation",
+        scene(2),
+        "",
+        {"constant_rig_from_world_rotation": True},
+        gauge=two,
+    )
     yield made("TwoViewConstantCamera", scene(2), flat, gauge=two, lenses=[1])
     yield made("VariableImage", scene(3), gauge=two)
     yield made("ConstantFocalLength", scene(3), "", {"refine_focal_length": False}, gauge=two)
-    yield made("VariablePrincipalPoint", scene(2), flat, {"refine_principal_point": True}, gauge=two)
+    yield made(
+        "VariablePrincipalPoint", scene(2), flat, {"refine_principal_point": True}, gauge=two
+    )
     yield made("ConstantExtraParam", scene(2), flat, {"refine_extra_params": False}, gauge=two)
     ten = scene()
-    yield made("ConstantPoints3D", ten, "COLMAP fixes a gauge that points fix", {"refine_points3D": False}, gauge=two)
+    yield made(
+        "ConstantPoints3D",
+        ten,
+        "COLMAP fixes a gauge that points fix",
+        {"refine_points3D": False},
+        gauge=two,
+    )
     for held in (0, 1, 3, 4):
-        yield made(f"FixGaugeWithThreePoints, {held} held", ten, other, gauge=three, points=sorted(ten.points3D)[:held])
+        yield made(
+            f"FixGaugeWithThreePoints, {held} held",
+            ten,
+            other,
+            gauge=three,
+            points=sorted(ten.points3D)[:held],
+        )
     yield made("FixGaugeWithTwoCams, a frame held", ten, gauge=two, frames=[1])
-    yield made("FixGaugeWithTwoCams, sensors held, a frame held", many, less, gauge=two, sensors=sensors, frames=[1])
+    yield made(
+        "FixGaugeWithTwoCams, sensors held, a frame held",
+        many,
+        less,
+        gauge=two,
+        sensors=sensors,
+        frames=[1],
+    )
     yield made("one frame: falls back to three points", scene(1, 3, 1), other, gauge=two)
     yield made("PartiallyContainedTracks", ten, images=sorted(ten.images)[:2], frames=[1])
     forced = sorted(ten.points3D)[:1]
-    yield made("PartiallyContainedTracksForceToOptimizePoint", ten, images=sorted(ten.images)[:2], variable=forced)
+    yield made(
+        "PartiallyContainedTracksForceToOptimizePoint",
+        ten,
+        images=sorted(ten.images)[:2],
+        variable=forced,
+    )
     yield made("MinimumTrackLength", shortened(ten), "", {"min_track_length": 10}, gauge=two)
 
 
@@ -125,7 +177,11 @@ def solved(one: Situation, *, tight: bool) -> tuple[int, float, int, int, float,
     options.print_summary = False
     ceres = options.ceres.solver_options
     if tight:
-        ceres.function_tolerance, ceres.gradient_tolerance, ceres.parameter_tolerance = 1e-15, 1e-12, 1e-15
+        ceres.function_tolerance, ceres.gradient_tolerance, ceres.parameter_tolerance = (
+            1e-15,
+            1e-12,
+            1e-15,
+        )
         ceres.max_num_iterations = 300
     for name, value in one.options.items():
         setattr(options, name, value)
@@ -149,11 +205,22 @@ def solved(one: Situation, *, tight: bool) -> tuple[int, float, int, int, float,
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--markdown", action="store_true")
     markdown = parser.parse_args().markdown
-    heading = ("situation", "unknowns, COLMAP and jaxba", "cost less one, tight", "default", "iterations", "remark")
-    line = lambda cells: f"| {' | '.join(cells)} |" if markdown else "  ".join(f"{cell:>14}" for cell in cells)
+    heading = (
+        "situation",
+        "unknowns, COLMAP and jaxba",
+        "cost less one, tight",
+        "default",
+        "iterations",
+        "remark",
+    )
+    line = lambda cells: (
+        f"| {' | '.join(cells)} |" if markdown else "  ".join(f"{cell:>14}" for cell in cells)
+    )
     print(line(heading))
     if markdown:
         print(line(["---"] * len(heading)))
@@ -167,7 +234,14 @@ def main() -> None:
         excess = own / cost - 1, own_usual / usual - 1
         equal = free == unknowns and abs(excess[0]) < 1e-9
         remark = "" if equal else one.why or "differs"
-        cells = one.name, f"{free} {unknowns}", f"{excess[0]:.1e}", f"{excess[1]:.1e}", f"{count} {iterations}", remark
+        cells = (
+            one.name,
+            f"{free} {unknowns}",
+            f"{excess[0]:.1e}",
+            f"{excess[1]:.1e}",
+            f"{count} {iterations}",
+            remark,
+        )
         print(line(cells), flush=True)
 
 

@@ -1,14 +1,14 @@
 """Time to compile the parts of a step and time to run them, at each level of optimisation.
 
-    python -m benchmarks.compilation PROBLEM ... [--solver guarded] [--linear-solver auto] [--repeats 15]
-    python -m benchmarks.compilation PROBLEM ... --whole
+    python -m benchmarks.compilation PROBLEM ... [--solver guarded] [--linear-solver auto]
+    [--repeats 15] python -m benchmarks.compilation PROBLEM ... --whole
 
-PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The last column shows after
-how many runs, times the observations of the problem and in millions, the faster programs of a better level have repaid
-its longer compilation; the constants of `jaxba/runtime/compilation.py` come from them. The levels are timed alternately
-in one process, without a compilation cache, at the start of the problem with lambda 1e-4. `--whole` times calls of
-`jaxba-solve FILE` alternately with `--compilation auto` and `full`.
-"""
+PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The last
+column shows after how many runs, times the observations of the problem and in millions, the faster
+programs of a better level have repaid its longer compilation; the constants of
+`jaxba/runtime/compilation.py` come from them. The levels are timed alternately in one process,
+without a compilation cache, at the start of the problem with lambda 1e-4. `--whole` times calls of
+`jaxba-solve FILE` alternately with `--compilation auto` and `full`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,9 @@ HEADING = (
 )
 
 
-def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -> tuple[float, float]:
+def measure(
+    step: Any, arguments: tuple[Any, ...], level: Level, repeats: int
+) -> tuple[float, float]:
     """Seconds of compilation including tracing, and median seconds of a run."""
     options: Any = compiler_options(level)
     started = time.perf_counter()
@@ -74,7 +76,9 @@ def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -
     return compile_s, float(np.median(times))
 
 
-def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats: int) -> Iterator[str]:
+def rows(
+    location: str, solver: str, linear_solver: LinearSolverChoice, repeats: int
+) -> Iterator[str]:
     """Lines of the table for the parts of a step on a problem."""
     source = sources([location])[0]
     problem, name = source.read(), parse_solver(solver)
@@ -87,15 +91,21 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
         state = jax.jit(step.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
         propose = lambda la, s, d: step.propose(la, s, d, options)
-        proposal = jax.jit(lambda *given: propose(*given))(*given)  # a separate program, not the one that is timed
+        # a separate program, not the one that is timed
+        proposal = jax.jit(lambda *given: propose(*given))(*given)
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
             "propose": (propose, given),
-            "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
+            "try_step": (
+                lambda la, s, d, p: step.try_step(la, s, d, p, options),
+                (*given, proposal),
+            ),
         }
         if has_repairs(options):
             del parts["try_step"]
             search = first_search(state.cameras, state.points, state.cost, proposal.step)
-            candidate = lambda la, s, p, *rest: try_candidate(la, s, p, options, jnp.zeros((), dtype), *rest)
+            candidate = lambda la, s, p, *rest: try_candidate(
+                la, s, p, options, jnp.zeros((), dtype), *rest
+            )
             parts["candidate"] = (candidate, (layout, state, proposal, search, state.cameras))
         if options.refinement.camera_rounds:
             cameras = lambda la, c, p: refine_cameras(la, c, p, options)
@@ -113,14 +123,15 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
 
 
 WHOLE = (
-    f"{'problem':28s} {'auto: whole s':>13s} {'compile s':>9s} {'iter':>4s} {'full: whole s':>13s} {'compile s':>9s} "
+    f"{'problem':28s} {'auto: whole s':>13s} {'compile s':>9s} {'iter':>4s} {'full: whole s':>13s} "
+    f"{'compile s':>9s} "
     f"{'iter':>4s} {'auto/full':>9s} {'ends differ':>11s}"
 )
 
 
 def whole(location: str) -> tuple[str, float]:
-    """Calls of `jaxba-solve` with `--compilation auto` and `full` without a cache: the line of the table, and the ratio
-    of their times."""
+    """Calls of `jaxba-solve` with `--compilation auto` and `full` without a cache: the line of the
+    table, and the ratio of their times."""
     cells, costs, seconds = f"{Path(location).name[:28]:28s}", [], []
     with tempfile.TemporaryDirectory() as folder:
         for compilation in ("auto", "full"):
@@ -128,7 +139,9 @@ def whole(location: str) -> tuple[str, float]:
             command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", location]
             command += ["--compilation", compilation, "--log", str(log)]
             started = time.perf_counter()
-            subprocess.run(command, env={**os.environ, "JAXBA_CACHE": "off"}, check=True, capture_output=True)
+            subprocess.run(
+                command, env={**os.environ, "JAXBA_CACHE": "off"}, check=True, capture_output=True
+            )
             seconds.append(time.perf_counter() - started)
             record = json.loads(log.read_text())
             costs.append(record["final_cost"])

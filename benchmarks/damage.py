@@ -1,4 +1,5 @@
-"""Random damage to the bytes of files: cut, flipped, repeated, removed and swapped fields and lines, absurd numbers."""
+"""Random damage to the bytes of files: cut, flipped, repeated, removed and swapped fields and
+lines, absurd numbers."""
 
 from __future__ import annotations
 
@@ -9,8 +10,30 @@ from pathlib import Path
 
 import numpy as np
 
-WORDS = (b"", b"-1", b"0", b"1.5", b"nan", b"-inf", b"1e999", b"1e308", b"1e-999", b"abc", b"\xff\xfe", b"1_0", b"1,5")
-COUNTS = (b"2147483647", b"4294967296", b"1000000000000000000", b"99999999999999999999", b"9" * 400, b"0x10", b"-0")
+WORDS = (
+    b"",
+    b"-1",
+    b"0",
+    b"1.5",
+    b"nan",
+    b"-inf",
+    b"1e999",
+    b"1e308",
+    b"1e-999",
+    b"abc",
+    b"\xff\xfe",
+    b"1_0",
+    b"1,5",
+)
+COUNTS = (
+    b"2147483647",
+    b"4294967296",
+    b"1000000000000000000",
+    b"99999999999999999999",
+    b"9" * 400,
+    b"0x10",
+    b"-0",
+)
 """Words in place of those of a text."""
 
 NEW_NUMBERS = (b"0", b"1", b"2", b"-1", b"5", b"39", b"40", b"1e-12", b"1e12", b"0.0", b"1e200")
@@ -51,7 +74,8 @@ def _repeat(content: bytearray, rng: np.random.Generator) -> None:
 
 def _number(content: bytearray, rng: np.random.Generator) -> None:
     start, new = int(rng.integers(len(content))), NUMBERS[rng.integers(len(NUMBERS))]
-    start -= start % len(new) if rng.random() < 0.5 else 0  # counts stand at the beginning, and after it at multiples
+    # counts stand at the beginning, and after it at multiples
+    start -= start % len(new) if rng.random() < 0.5 else 0
     content[start : start + len(new)] = new
 
 
@@ -63,7 +87,11 @@ def _words(change: Callable[[list[bytes], np.ndarray, np.random.Generator], None
     """A damage of words or, half of the time, lines, of which it gets all and two random places."""
 
     def damage(content: bytearray, rng: np.random.Generator) -> None:
-        parts = SEPARATORS.split(bytes(content)) if rng.random() < 0.5 else re.split(rb"(\n)", bytes(content))
+        parts = (
+            SEPARATORS.split(bytes(content))
+            if rng.random() < 0.5
+            else re.split(rb"(\n)", bytes(content))
+        )
         change(parts, 2 * rng.integers((len(parts) + 1) // 2, size=2), rng)
         content[:] = b"".join(parts)
 
@@ -116,7 +144,11 @@ def _change_number(parts: list[bytes], at: np.ndarray, rng: np.random.Generator)
 
 
 BYTES = (_flip, _cut, _remove, _insert, _repeat, _number)
-TEXT = (*BYTES, *8 * (_change_number,), *(_replace_word, _swap_words, _copy_word, _remove_word, _repeat_word))
+TEXT = (
+    *BYTES,
+    *8 * (_change_number,),
+    *(_replace_word, _swap_words, _copy_word, _remove_word, _repeat_word),
+)
 BINARY = (*BYTES, *6 * (_number,), _head)
 
 
@@ -131,7 +163,8 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damage_folder(folder: Path, rng: np.random.Generator) -> None:
-    """Damages one file in the folder, or now and then empties or removes it, or swaps it with another one."""
+    """Damages one file in the folder, or now and then empties or removes it, or swaps it with
+    another one."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     one, other = (files[k] for k in rng.integers(len(files), size=2))
     kind = rng.random()

@@ -1,20 +1,22 @@
-"""Which policy should be the default: solves of whole problems, of windows of them, and of random scenes.
+"""Which policy should be the default: solves of whole problems, of windows of them, and of random
+scenes.
 
-    python -m benchmarks.default_policy [SOLVER ...] [--draw 0] [--groups whole window scene] [--out FILE] [--within]
+    python -m benchmarks.default_policy [SOLVER ...] [--draw 0] [--groups whole window scene] [--out
+    FILE] [--within]
 
-Problems come from `JAXBA_DATA`: each whole file, windows of 4 to 40 neighbouring cameras, as they are or disturbed by
-0.3 and 1 degree, and random scenes of 20 to 2,000 cameras whose path drifts, a third of them far from the truth.
-`--draw` is the seed of windows and scenes: a policy is chosen on one draw and judged on another. `--out` keeps what was
-solved, so that a run goes on where it was, and more solvers can join.
+Problems come from `JAXBA_DATA`: each whole file, windows of 4 to 40 neighbouring cameras, as they
+are or disturbed by 0.3 and 1 degree, and random scenes of 20 to 2,000 cameras whose path drifts, a
+third of them far from the truth. `--draw` is the seed of windows and scenes: a policy is chosen on
+one draw and judged on another. `--out` keeps what was solved, so that a run goes on where it was,
+and more solvers can join.
 
-The price of a solve is its iterations, and 0.25 for each repair (the median of measured times). A row has a solver's
-price over that of the first solver, problem by problem, to 1e-3 and 1e-4 above the best known cost and to its end, with
-95% intervals; how often it never came there; its largest price over the cheaper one of `guarded` and `bold`; and how
-far above the best end it ends.
+The price of a solve is its iterations, and 0.25 for each repair (the median of measured times). A
+row has a solver's price over that of the first solver, problem by problem, to 1e-3 and 1e-4 above
+the best known cost and to its end, with 95% intervals; how often it never came there; its largest
+price over the cheaper one of `guarded` and `bold`; and how far above the best end it ends.
 
-`--within` judges the estimated distance to the end (`distance_to_end`) on the solves of the first solver: how many stop
-within the tolerance, and after how many iterations.
-"""
+`--within` judges the estimated distance to the end (`distance_to_end`) on the solves of the first
+solver: how many stop within the tolerance, and after how many iterations."""
 
 from __future__ import annotations
 
@@ -60,7 +62,8 @@ DEGREES = (0.0, 0.3, 1.0)
 """Disturbances of windows, one after the other."""
 
 OPTIMISED, UNDISTURBED = "-post", 0.1
-"""Problems of this name begin at their end, so that their windows are disturbed by so many degrees at least."""
+"""Problems of this name begin at their end, so that their windows are disturbed by so many degrees
+at least."""
 
 WINDOWS, LARGEST_WINDOW = 6, 40
 """Windows of a problem, and cameras of the largest."""
@@ -83,7 +86,8 @@ class Case(NamedTuple):
 
 
 def disturbed(problem: BundleProblem, seed: int, degrees: float) -> BundleProblem:
-    """Rotations are off by an angle, centres and points by a fiftieth of the median distance per degree."""
+    """Rotations are off by an angle, centres and points by a fiftieth of the median distance per
+    degree."""
     centers = camera_centers(np.asarray(problem.cameras))
     size = float(np.median(np.linalg.norm(centers - np.median(centers, 0), axis=1))) or 1.0
     moved = 0.02 * degrees * size
@@ -95,7 +99,9 @@ def cases(draw: int) -> Iterator[Case]:
     for source in sources(real_problems()):
         problem, rng = source.read(), np.random.default_rng([draw, len(source.name)])
         optimised = OPTIMISED in source.name
-        yield Case("whole", source.name, disturbed(problem, draw, DEGREES[1]) if optimised else problem)
+        yield Case(
+            "whole", source.name, disturbed(problem, draw, DEGREES[1]) if optimised else problem
+        )
         linked = covisible(problem)
         np.fill_diagonal(linked, 0)
         for number in range(WINDOWS if problem.num_cameras > 12 else 2):
@@ -109,12 +115,15 @@ def cases(draw: int) -> Iterator[Case]:
             yield Case(f"window, {degrees:g} degrees", f"{source.name}/{number}", start)
     for number, (name, config) in enumerate(_scenes()):
         yield Case(
-            "scene, far" if name.endswith("far") else "scene", name, jaxba.random_scene(config, 100 * draw + number)
+            "scene, far" if name.endswith("far") else "scene",
+            name,
+            jaxba.random_scene(config, 100 * draw + number),
         )
 
 
 def _neighbours(linked: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Cameras that join one by one, each time the one that shares most points with those already there."""
+    """Cameras that join one by one, each time the one that shares most points with those already
+    there."""
     chosen = [int(rng.integers(len(linked)))]
     while len(chosen) < size:
         rest = np.setdiff1d(np.arange(len(linked)), chosen)
@@ -124,12 +133,18 @@ def _neighbours(linked: np.ndarray, size: int, rng: np.random.Generator) -> np.n
 
 def _scenes() -> Iterator[tuple[str, SceneConfig]]:
     orbit = SceneConfig(trajectory="orbit", min_depth=4.0, max_depth=16.0)
-    kinds = {"street": LIKE["ladybug-49"], "lateral": SceneConfig(trajectory="lateral"), "orbit": orbit}
+    kinds = {
+        "street": LIKE["ladybug-49"],
+        "lateral": SceneConfig(trajectory="lateral"),
+        "orbit": orbit,
+    }
     for cameras in CAMERAS:
         for kind, config in {**kinds, "photos": LIKE["trafalgar-21"]}.items():
             drift = 0.0 if kind == "photos" else 0.3 * cameras**-1.5
             points = (25 if cameras < MANY else 12) * cameras
-            base = replace(config, cameras=cameras, points=points, observations=0, start_drift=drift)
+            base = replace(
+                config, cameras=cameras, points=points, observations=0, start_drift=drift
+            )
             base = replace(base, outlier_share=0.002, outlier_size=10.0)
             yield f"{kind}-{cameras}", base
             if cameras < MANY:
@@ -143,7 +158,11 @@ def play(problem: BundleProblem, solver: str) -> dict[str, Any]:
     options = replace(options, compilation="full", pad=True if small else None)
     solution = jaxba.solve(problem, policy, options, callback=lambda record: None)
     history = {name: np.asarray(x).tolist() for name, x in solution.history._asdict().items()}
-    ends = {"initial": solution.initial_cost, "final": solution.final_cost, "converged": solution.converged}
+    ends = {
+        "initial": solution.initial_cost,
+        "final": solution.final_cost,
+        "converged": solution.converged,
+    }
     return {**ends, "history": history, "linear_solver": solution.linear_solver}
 
 
@@ -161,9 +180,14 @@ def rows(runs: dict[str, dict[str, Any]], names: list[str], first: str) -> Itera
     for name in names:
         cells = []
         for tolerance in TOLERANCES:
-            target = lambda problem, run: best[problem] * (1 + tolerance) if tolerance else run["final"]  # noqa: B023
+
+            def target(problem, run, tolerance=tolerance):
+                return best[problem] * (1 + tolerance) if tolerance else run["final"]
+
             prices = {
-                one: np.array([price(found[one], target(p, found[one])) for p, found in runs.items()])
+                one: np.array(
+                    [price(found[one], target(p, found[one])) for p, found in runs.items()]
+                )
                 for one in dict.fromkeys([name, first, *(y for y in YARDSTICKS if y in names)])
             }
             mine, theirs = prices[name], prices[first]
@@ -171,8 +195,13 @@ def rows(runs: dict[str, dict[str, Any]], names: list[str], first: str) -> Itera
             better = np.min([prices[y] for y in YARDSTICKS if y in prices] or [theirs], axis=0)
             known = np.isfinite(better) & np.isfinite(mine)
             worst = float(np.max(mine[known] / better[known])) if known.any() else np.nan
-            ratio, low, high = paired_ratio(mine[both], theirs[both]) if both.any() else (np.nan,) * 3
-            cells.append(f"{ratio:.2f} [{low:.2f}, {high:.2f}] {int(np.sum(~np.isfinite(mine))):2d} {worst:4.1f}")
+            ratio, low, high = (
+                paired_ratio(mine[both], theirs[both]) if both.any() else (np.nan,) * 3
+            )
+            cells.append(
+                f"{ratio:.2f} [{low:.2f}, {high:.2f}] {int(np.sum(~np.isfinite(mine))):2d} "
+                f"{worst:4.1f}"
+            )
         above = np.array([found[name]["final"] / best[p] - 1 for p, found in runs.items()])
         ends = f"{np.mean(above > 1e-3):4.0%} {np.mean(above > 1e-2):4.0%} {above.max():7.4f}"
         yield f"{name:24s} | " + " | ".join(cells) + f" | {ends}"
@@ -186,7 +215,9 @@ def judge(runs: dict[str, dict[str, Any]], solver: str) -> Iterator[str]:
             run = found[solver]
             if not run["converged"]:
                 continue
-            step = jaxba.StepInfo._make(np.array(run["history"][name]) for name in jaxba.StepInfo._fields)
+            step = jaxba.StepInfo._make(
+                np.array(run["history"][name]) for name in jaxba.StepInfo._fields
+            )
             stops = np.flatnonzero(distance_to_end(step, np.where) <= within)
             last = int(stops[0]) if len(stops) else len(step.cost) - 1
             covered.append(step.cost[last] <= run["final"] * (1 + within))
@@ -198,7 +229,9 @@ def judge(runs: dict[str, dict[str, Any]], solver: str) -> Iterator[str]:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("solver", nargs="*", default=SOLVERS)
     parser.add_argument("--draw", type=int, default=0)
     parser.add_argument("--groups", nargs="*", default=("whole", "window", "scene"))
@@ -216,14 +249,22 @@ def main() -> None:
         for solver in names:
             key = args.draw, name, solver
             if key not in known:
-                known[key] = {"draw": args.draw, "name": name, "solver": solver, **play(problem, solver)}
+                known[key] = {
+                    "draw": args.draw,
+                    "name": name,
+                    "solver": solver,
+                    **play(problem, solver),
+                }
                 if args.out:
                     with args.out.open("a") as file:
                         file.write(json.dumps(known[key]) + "\n")
             groups[group].setdefault(name, {})[solver] = known[key]
         print(f"{group}: {name}", file=sys.stderr, flush=True)
     together = {name: found for group in groups.values() for name, found in group.items()}
-    print("solver | to 1e-3: ratio [interval], failures, largest | to 1e-4 | to the end | above best by 0.1%, 1%, most")
+    print(
+        "solver | to 1e-3: ratio [interval], failures, largest | to 1e-4 | to the end | above best "
+        "by 0.1%, 1%, most"
+    )
     for group, runs in {**groups, "all": together}.items():
         print(f"{group} ({len(runs)})", *rows(runs, names, names[0]), sep="\n")
     if args.within:

@@ -1,12 +1,13 @@
 """A solve on several devices beside one: costs of every iteration, collectives, memory, seconds.
 
-    python -m benchmarks.devices [--devices 1,2,4,8] [--problems FILE ...] [--solvers guarded,ceres] [--iterations 10]
+    python -m benchmarks.devices [--devices 1,2,4,8] [--problems FILE ...] [--solvers guarded,ceres]
+    [--iterations 10]
 
-On a CPU the devices are virtual and share its cores, so that seconds show what the division costs, not what it gains.
-By default two BAL and two other real problems of `JAXBA_DATA`. For every problem, solver and linear solver the table
-has the largest relative difference of a cost from that on one device over the iterations, and seconds over those of one
-device. Then the sums over devices in the program of an iteration, and the bytes of layout and parameters on each.
-"""
+On a CPU the devices are virtual and share its cores, so that seconds show what the division costs,
+not what it gains. By default two BAL and two other real problems of `JAXBA_DATA`. For every
+problem, solver and linear solver the table has the largest relative difference of a cost from that
+on one device over the iterations, and seconds over those of one device. Then the sums over devices
+in the program of an iteration, and the bytes of layout and parameters on each."""
 
 from __future__ import annotations
 
@@ -56,7 +57,9 @@ def bytes_per_device(setup: Setup) -> list[int]:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--devices", default="1,2,4,8")
     parser.add_argument("--problems", nargs="*", default=None)
     parser.add_argument("--solvers", default="guarded,ceres")
@@ -68,14 +71,20 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     folder = Path(os.environ.get("JAXBA_DATA", "."))
     files = args.problems or [str(folder / name) for name in PROBLEMS]
-    print(f"{'problem':28s}{'solver':10s}{'linear':10s}" + "".join(f"{f'{n} devices':>24s}" for n in counts[1:]))
+    print(
+        f"{'problem':28s}{'solver':10s}{'linear':10s}"
+        + "".join(f"{f'{n} devices':>24s}" for n in counts[1:])
+    )
     for file in files:
         problem = jaxba.read_problem(file)
         for name in args.solvers.split(","):
             for linear_solver in args.linear_solvers.split(","):
                 policy, options = parse_solver(name).build()
                 options = dataclasses.replace(
-                    options, linear_solver=linear_solver, compilation="full", max_iterations=args.iterations
+                    options,
+                    linear_solver=linear_solver,
+                    compilation="full",
+                    max_iterations=args.iterations,
                 )
                 runs = []
                 for count in counts:
@@ -85,7 +94,9 @@ def main() -> None:
                 cells = [_cell(run, runs[0]) for run in runs[1:]]
                 stem = Path(file).name.split(".")[0].removeprefix("colmap-")[:26]
                 print(
-                    f"{stem:28s}{name:10s}{linear_solver:10s}" + "".join(f"{cell:>24s}" for cell in cells), flush=True
+                    f"{stem:28s}{name:10s}{linear_solver:10s}"
+                    + "".join(f"{cell:>24s}" for cell in cells),
+                    flush=True,
                 )
     for linear_solver in args.linear_solvers.split(","):
         for name in args.solvers.split(","):
@@ -94,9 +105,13 @@ def main() -> None:
             setup = set_up(problem, policy, one)
             print(f"collectives in an iteration, {name}, {linear_solver}: {collectives(setup)}")
     for count in counts[1:]:
-        setup = set_up(problem, "ceres", jaxba.SolveOptions(linear_solver="implicit", devices=count))
+        setup = set_up(
+            problem, "ceres", jaxba.SolveOptions(linear_solver="implicit", devices=count)
+        )
         sizes = bytes_per_device(setup)
-        print(f"layout on each of {count} devices, implicit: {min(sizes):,} to {max(sizes):,} bytes")
+        print(
+            f"layout on each of {count} devices, implicit: {min(sizes):,} to {max(sizes):,} bytes"
+        )
 
 
 def _cell(run: jaxba.Solution, one: jaxba.Solution) -> str:

@@ -1,21 +1,26 @@
-"""What λ is worth: foresight, the best λ that can be predicted, and one constant λ, over the same scenes.
+"""What λ is worth: foresight, the best λ that can be predicted, and one constant λ, over the same
+scenes.
 
-    python -m benchmarks.foresight [--steps plain embedded] [--problems FILE ...] [--scenes 900] [--out FILE]
+    python -m benchmarks.foresight [--steps plain embedded] [--problems FILE ...] [--scenes 900]
+    [--out FILE]
 
-The base is the constant action with the fewest iterations on the training scenes. From every state of its episodes, in
-which some actions are drawn at random, each of a grid of lambdas is tried once and followed by the base to the true
-end. These exact numbers say three things:
+The base is the constant action with the fewest iterations on the training scenes. From every state
+of its episodes, in which some actions are drawn at random, each of a grid of lambdas is tried once
+and followed by the base to the true end. These exact numbers say three things:
 
-- `foresight`: held-out scenes played by a look-ahead that knows them, and takes the best one in every state (Bertsekas,
-  Tsitsiklis and Wu 1997, "Rollout Algorithms for Combinatorial Optimization").
-- `R2`: how much of an action's advantage over the base's, log(iterations / iterations of the base), a network predicts
-  from what an agent observes, on training scenes that it was not fitted to; the largest over the actions.
-- `predicted`: held-out scenes played by the policy that takes the action of the best predicted advantage, or the base's
-  unless it promises more than a margin, which is chosen on the training scenes.
+- `foresight`: held-out scenes played by a look-ahead that knows them, and takes the best one in
+  every state (Bertsekas, Tsitsiklis and Wu 1997, "Rollout Algorithms for Combinatorial
+  Optimization").
+- `R2`: how much of an action's advantage over the base's, log(iterations / iterations of the base),
+  a network predicts from what an agent observes, on training scenes that it was not fitted to; the
+  largest over the actions.
+- `predicted`: held-out scenes played by the policy that takes the action of the best predicted
+  advantage, or the base's unless it promises more than a margin, which is chosen on the training
+  scenes.
 
-Ratios are geometric means of iterations over those of the base, scene by scene, with 95% intervals. Scenes are random
-ones, or with `--problems` windows of real problems. A row takes five to fifteen minutes on two cores.
-"""
+Ratios are geometric means of iterations over those of the base, scene by scene, with 95% intervals.
+Scenes are random ones, or with `--problems` windows of real problems. A row takes five to fifteen
+minutes on two cores."""
 
 from __future__ import annotations
 
@@ -54,19 +59,22 @@ DECADES = (-9.0, -8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 0.0)
 """log10 of the lambdas that are tried from a state, beside the base's own."""
 
 FREE = {"first_low": -9.0, "descent": 11.0}
-"""Limits of the guard that leave lambda free: what is asked here is what it is worth, not what a limit costs."""
+"""Limits of the guard that leave lambda free: what is asked here is what it is worth, not what a
+limit costs."""
 
 STATES = 12
 """States of an episode that are looked at."""
 
 EXPLORED = 0.3
-"""Share of the base's actions that are drawn at random instead, so that states off its path are seen, too."""
+"""Share of the base's actions that are drawn at random instead, so that states off its path are
+seen, too."""
 
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """Of a predicted advantage, in logarithms."""
 
 FOLDS, WIDTH, EPOCHS, BATCH = 5, 96, 80, 256
-"""Of the networks: folds of the scenes, one network each; units of each of two hidden layers; training."""
+"""Of the networks: folds of the scenes, one network each; units of each of two hidden layers;
+training."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,8 @@ def play_on(
     actions: Float[Array, "tries actions"],
     start: Episode,
 ) -> Int[Array, " tries"]:
-    """Iterations of an episode to its end, if each of some actions is played once and then the policy's.
+    """Iterations of an episode to its end, if each of some actions is played once and then the
+    policy's.
 
     Args:
         game: rules; `reward` and bonus play no part.
@@ -125,7 +134,9 @@ def play_on(
         return jax.tree.map(lambda old, new: jnp.where(_ended(game, run), old, new), run, after)
 
     under_way = lambda runs: ~jnp.all(jax.vmap(functools.partial(_ended, game))(runs))
-    return lax.while_loop(under_way, lambda runs: step_groups(turn, runs), first(actions)).iterations
+    return lax.while_loop(
+        under_way, lambda runs: step_groups(turn, runs), first(actions)
+    ).iterations
 
 
 def _advance(game: Game, bank: Bank, run: Played, action: Float[Array, " actions"]) -> Played:
@@ -142,7 +153,9 @@ def _ended(game: Game, run: Played) -> Bool[Array, ""]:
 
 
 @functools.partial(jax.jit, static_argnames=("looks",))
-def _look_ahead(game: Game, policy: AgentPolicy, actions: Array, looks: bool) -> tuple[Array, Array]:
+def _look_ahead(
+    game: Game, policy: AgentPolicy, actions: Array, looks: bool
+) -> tuple[Array, Array]:
     bank = game.bank
 
     def one(scene: Int[Array, ""]) -> tuple[Array, Array]:
@@ -214,7 +227,9 @@ def _collect(game: Game, policy: AgentPolicy, actions: Array, key: Array) -> tup
     return lax.map(one, jnp.arange(bank.initial_cost.shape[0], dtype=jnp.int32))
 
 
-def collect(game: Game, policy: AgentPolicy, actions: Float[np.ndarray, "tries actions"], seed: int) -> Labels:
+def collect(
+    game: Game, policy: AgentPolicy, actions: Float[np.ndarray, "tries actions"], seed: int
+) -> Labels:
     """Exact labels of the states of the base's episodes on the bank of a game."""
     found = _collect(game, policy, jnp.asarray(actions, jnp.float32), jax.random.key(seed))
     alive, seen, left = (np.asarray(x) for x in found)
@@ -237,7 +252,10 @@ def _fitted(key: Array, x: Array, y: Array, held: Array, truth: Array) -> Networ
     sizes = (x.shape[1], WIDTH, WIDTH, y.shape[1])
     shapes = list(itertools.pairwise(sizes))
     network = [
-        (jax.random.normal(k, shape, jnp.float32) * (2 / shape[0]) ** 0.5, jnp.zeros(shape[1], jnp.float32))
+        (
+            jax.random.normal(k, shape, jnp.float32) * (2 / shape[0]) ** 0.5,
+            jnp.zeros(shape[1], jnp.float32),
+        )
         for k, shape in zip(jax.random.split(key, len(shapes)), shapes, strict=True)
     ]
     steps = max(1, len(x) // BATCH)
@@ -282,8 +300,11 @@ class Predicted(AgentPolicy):
         return self.actions[jnp.where(change[best] < -self.margin, best, 0)]
 
 
-def fit(labels: Labels, base: LearnedPolicy, actions: Float[np.ndarray, "tries actions"], seed: int) -> Any:
-    """The policy of the predicted advantages, and R2 of each action's on the scenes of the other folds."""
+def fit(
+    labels: Labels, base: LearnedPolicy, actions: Float[np.ndarray, "tries actions"], seed: int
+) -> Any:
+    """The policy of the predicted advantages, and R2 of each action's on the scenes of the other
+    folds."""
     x = labels.seen
     change = np.log(labels.iterations / labels.iterations[:, :1]).astype(np.float32)
     mean, scale = x.mean(axis=0), x.std(axis=0) + 1e-3
@@ -295,7 +316,10 @@ def fit(labels: Labels, base: LearnedPolicy, actions: Float[np.ndarray, "tries a
         key = jax.random.fold_in(jax.random.key(seed), number)
         # rows repeated to one size, so that all folds share a program
         pad = lambda rows, size: jnp.asarray(rows[np.arange(size) % len(rows)])
-        sizes = max((fold != k).sum() for k in range(FOLDS)), max((fold == k).sum() for k in range(FOLDS))
+        sizes = (
+            max((fold != k).sum() for k in range(FOLDS)),
+            max((fold == k).sum() for k in range(FOLDS)),
+        )
         parts = (
             pad(x[~held], sizes[0]),
             pad(change[~held], sizes[0]),
@@ -310,7 +334,9 @@ def fit(labels: Labels, base: LearnedPolicy, actions: Float[np.ndarray, "tries a
     margin = min(MARGINS, key=paid)
     spread = np.maximum(change[:, 1:].var(axis=0), 1e-9)
     explained = 1 - ((beyond - change)[:, 1:] ** 2).mean(axis=0) / spread
-    all_actions = jnp.concatenate([base.act(jnp.asarray(labels.seen[0]))[None], jnp.asarray(actions, jnp.float32)])
+    all_actions = jnp.concatenate(
+        [base.act(jnp.asarray(labels.seen[0]))[None], jnp.asarray(actions, jnp.float32)]
+    )
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *networks)
     numbers = (jnp.asarray(mean), jnp.asarray(scale), all_actions, jnp.float32(margin))
     return Predicted(stacked, *numbers, base.config), explained
@@ -326,12 +352,16 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     rules = GameConfig(agent, reward="constant", tolerance=1e-4)
     options = agent.step_options(bank_config.options)
     key = jax.random.key(args.seed)
-    split = make_split(bank_config, key, bank_config.options, rules.max_iterations, say, rules.tolerance)
+    split = make_split(
+        bank_config, key, bank_config.options, rules.max_iterations, say, rules.tolerance
+    )
     say(f"{len(split.train.initial_cost)} scenes, {len(split.held_out.initial_cost)} held out")
     constant = best_constant_action(kind, split.train, rules, options)
     base = always(constant, agent)
     say(f"base: action {constant:.2f}")
-    actions = np.array([[action_of(agent, jnp.float32(decades))] for decades in DECADES]).clip(-1, 1)
+    actions = np.array([[action_of(agent, jnp.float32(decades))] for decades in DECADES]).clip(
+        -1, 1
+    )
     game = lambda bank: make_game(rules, kind, bank, 1, bank_config.options)
     labels = collect(game(split.train), base, actions, args.seed)
     hindsight = np.exp(np.log(labels.iterations.min(axis=1) / labels.iterations[:, 0]).mean())
@@ -339,7 +369,11 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     policy, explained = fit(labels, base, actions, args.seed)
     say(f"R2 of the actions {np.round(explained, 2)}, margin {float(policy.margin):.2f}")
     taken = {}
-    for name, one, looks in (("base", base, False), ("foresight", base, True), ("predicted", policy, False)):
+    for name, one, looks in (
+        ("base", base, False),
+        ("foresight", base, True),
+        ("predicted", policy, False),
+    ):
         taken[name], _ = look_ahead(game(split.held_out), one, actions, looks)
         say(f"{name}: {np.exp(np.log(taken[name]).mean()):.2f} iterations")
     shown = lambda name: "{:.3f} [{:.3f}, {:.3f}]".format(*paired_ratio(taken[name], taken["base"]))
@@ -347,7 +381,16 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     source = f"{len(args.problems)} problems" if args.problems else "random"
     count = f"{len(split.train.initial_cost)} + {len(split.held_out.initial_cost)}"
     mean = f"{np.exp(np.log(taken['base']).mean()):.2f}"
-    return step, source, count, f"{damping:.0e}", mean, shown("foresight"), f"{explained.max():.2f}", shown("predicted")
+    return (
+        step,
+        source,
+        count,
+        f"{damping:.0e}",
+        mean,
+        shown("foresight"),
+        f"{explained.max():.2f}",
+        shown("predicted"),
+    )
 
 
 HEADING = ("step", "scenes of", "number", "base λ", "iterations", "foresight", "R2", "predicted")
@@ -360,7 +403,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     prepare_process()
     with process.single_blas_thread():
         rows = [row(args, step) for step in args.steps]
-    table = "\n".join("| " + " | ".join(cells) + " |" for cells in (HEADING, ["---"] * len(HEADING), *rows))
+    table = "\n".join(
+        "| " + " | ".join(cells) + " |" for cells in (HEADING, ["---"] * len(HEADING), *rows)
+    )
     print(table)
     if args.out:
         args.out.write_text(table + "\n")

@@ -1,14 +1,15 @@
-"""Gives damaged inputs of every kind to the commands: each is refused in one line, or solved with a finite cost.
+"""Gives damaged inputs of every kind to the commands: each is refused in one line, or solved with a
+finite cost.
 
     python -m benchmarks.fuzz --cases 10000 --seed 0
 
-A case is a small input (`benchmarks/fuzz_inputs.py`) with random damage (`benchmarks/damage.py`), both determined by
-the seed and the number of the case. The command runs in a process that ends if its memory grows by more than a
-gigabyte, and is killed after a minute. What must hold: exit status 2, one line on standard error, nothing written, all
-within two seconds of processor time; or exit status 0 and a file of the result that reads back, with a finite cost.
-Configurations are only read: where the work of a training or a benchmark would begin, the case ends. Needs the extras
-ceres and kitti, and Linux.
-"""
+A case is a small input (`benchmarks/fuzz_inputs.py`) with random damage (`benchmarks/damage.py`),
+both determined by the seed and the number of the case. The command runs in a process that ends if
+its memory grows by more than a gigabyte, and is killed after a minute. What must hold: exit status
+2, one line on standard error, nothing written, all within two seconds of processor time; or exit
+status 0 and a file of the result that reads back, with a finite cost. Configurations are only read:
+where the work of a training or a benchmark would begin, the case ends. Needs the extras ceres and
+kitti, and Linux."""
 
 from __future__ import annotations
 
@@ -87,11 +88,16 @@ def kinds_of(args: Arguments) -> tuple[Input, ...]:
 def kind_of(kinds: Sequence[Input], seed: int, number: int) -> Input:
     """The kind of input of a case."""
     weights = np.array([one.weight for one in kinds], float)
-    return kinds[np.random.default_rng([seed, number]).choice(len(kinds), p=weights / weights.sum())]
+    return kinds[
+        np.random.default_rng([seed, number]).choice(len(kinds), p=weights / weights.sum())
+    ]
 
 
-def run_case(kind: Input, folder: Path, masters: Path, seed: int, number: int | None) -> tuple[str, str]:
-    """Makes a damaged input (undamaged if its number is None), runs its command, and looks at what became of it.
+def run_case(
+    kind: Input, folder: Path, masters: Path, seed: int, number: int | None
+) -> tuple[str, str]:
+    """Makes a damaged input (undamaged if its number is None), runs its command, and looks at what
+    became of it.
 
     Returns:
         "refused", "solved" or "read"; or "VIOLATED" and what was.
@@ -103,7 +109,9 @@ def run_case(kind: Input, folder: Path, masters: Path, seed: int, number: int | 
     if number is not None:
         damage_folder(given, np.random.default_rng([seed, number, 1]))
     out.mkdir()
-    arguments = [word.replace("IN", str(given), 1).replace("OUT", str(out), 1) for word in kind.arguments]
+    arguments = [
+        word.replace("IN", str(given), 1).replace("OUT", str(out), 1) for word in kind.arguments
+    ]
     command = importlib.import_module(f"jaxba.cli.{kind.command}")
     said, complained, started = io.StringIO(), io.StringIO(), time.process_time()
     try:
@@ -114,13 +122,17 @@ def run_case(kind: Input, folder: Path, masters: Path, seed: int, number: int | 
     except BaseException:
         return "VIOLATED", f"raised {traceback.format_exc().strip()}"
     seconds = time.process_time() - started
-    lines, files = complained.getvalue().splitlines(), [path for path in out.rglob("*") if path.is_file()]
+    lines, files = (
+        complained.getvalue().splitlines(),
+        [path for path in out.rglob("*") if path.is_file()],
+    )
     if status == 2:
         wrong = {
             f"{len(lines)} lines: {lines}": len(lines) != 1 or not lines[0].startswith("error: "),
             f"not printable: {lines}": not all(line.isprintable() for line in lines),
             f"wrote {files}": any(path.suffix in (".txt", ".json") for path in files),
-            f"took {seconds:.1f} s: {lines}": seconds > MOST_REFUSAL_SECONDS and kind.command == "solve",
+            f"took {seconds:.1f} s: {lines}": seconds > MOST_REFUSAL_SECONDS
+            and kind.command == "solve",
             f"ran out of memory: {lines}": "not enough memory" in complained.getvalue(),
         }
         broken = [what for what, is_so in wrong.items() if is_so]
@@ -158,17 +170,25 @@ def work(pipe: connection.Connection, folder: Path, args: Arguments) -> None:
             kind = kind_of(kinds, seed, number)
             before = _memory("VmRSS")
             Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
-            resource.setrlimit(resource.RLIMIT_DATA, (_memory("VmData") + MOST_MEMORY, resource.RLIM_INFINITY))
+            resource.setrlimit(
+                resource.RLIMIT_DATA, (_memory("VmData") + MOST_MEMORY, resource.RLIM_INFINITY)
+            )
             outcome = run_case(kind, folder, masters, seed, number)
             if _memory("VmHWM") - before > MOST_MEMORY:
                 outcome = "VIOLATED", "grew by more than a gigabyte"
-            resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+            resource.setrlimit(
+                resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+            )
             pipe.send((kind.name, *outcome))
 
 
 def _memory(field: str) -> int:
     """Bytes, of the memory of this process."""
-    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(field))
+    line = next(
+        line
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith(field)
+    )
     return int(line.split()[1]) * 1024
 
 
@@ -183,7 +203,9 @@ class Worker:
         if self.process is None or self.count >= CASES_OF_A_PROCESS:
             self.stop()
             self.pipe, other = get_context("spawn").Pipe()
-            self.process = get_context("spawn").Process(target=work, args=(other, self.folder, self.args), daemon=True)
+            self.process = get_context("spawn").Process(
+                target=work, args=(other, self.folder, self.args), daemon=True
+            )
             self.process.start()
             other.close()
             self.count = 0
@@ -227,7 +249,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if outcome == "VIOLATED":
                 print(f"case {number}, {kind}: {why}", flush=True)
                 if args.keep:
-                    shutil.copytree(folder / "in", Path(args.keep) / str(number), dirs_exist_ok=True)
+                    shutil.copytree(
+                        folder / "in", Path(args.keep) / str(number), dirs_exist_ok=True
+                    )
             elif args.cases == 1:
                 print(f"case {number}, {kind}: {outcome}")
             if (number + 1) % 500 == 0:
@@ -236,7 +260,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     outcomes = ("refused", "solved", "read", "VIOLATED")
     print(f"{'input':32}" + "".join(f"{outcome:>10}" for outcome in outcomes))
     for kind in kinds:
-        print(f"{kind.name:32}" + "".join(f"{counts[kind.name, outcome]:10}" for outcome in outcomes))
+        print(
+            f"{kind.name:32}" + "".join(f"{counts[kind.name, outcome]:10}" for outcome in outcomes)
+        )
     violated = sum(count for (_, outcome), count in counts.items() if outcome == "VIOLATED")
     print(f"{counts.total()} cases, seed {args.seed}: {violated} violations")
     return violated > 0

@@ -61,14 +61,27 @@ def _colmap(folder: Path, binary: bool = False) -> None:
 def _views() -> list[tuple[int, int, float, float]]:
     """Image, point and pixel of every observation; y points down."""
     pixels = np.asarray(geometry.project(SCENE)) * [1, -1]
-    return list(zip(SCENE.camera_index.tolist(), SCENE.point_index.tolist(), *pixels.T.tolist(), strict=True))
+    return list(
+        zip(
+            SCENE.camera_index.tolist(), SCENE.point_index.tolist(), *pixels.T.tolist(), strict=True
+        )
+    )
 
 
 def _opensfm(folder: Path) -> None:
     flip = np.diag([1.0, -1.0, -1.0])  # z to the front and y down
-    rotations = np.asarray(geometry.angle_axis(flip @ np.asarray(geometry.rotation_matrices(SCENE.cameras[:, :3]))))
+    rotations = np.asarray(
+        geometry.angle_axis(flip @ np.asarray(geometry.rotation_matrices(SCENE.cameras[:, :3])))
+    )
     translations = np.asarray(SCENE.cameras[:, 3:6]) @ flip
-    lens = {"projection_type": "perspective", "width": 1000, "height": 800, "focal": 0.7, "k1": 0.0, "k2": 0.0}
+    lens = {
+        "projection_type": "perspective",
+        "width": 1000,
+        "height": 800,
+        "focal": 0.7,
+        "k1": 0.0,
+        "k2": 0.0,
+    }
     shots = {
         f"{i}.jpg": {"camera": "a", "rotation": r.tolist(), "translation": t.tolist()}
         for i, (r, t) in enumerate(zip(rotations, translations, strict=True))
@@ -77,7 +90,10 @@ def _opensfm(folder: Path) -> None:
     (folder / "reconstruction.json").write_text(
         json.dumps([{"cameras": {"a": lens}, "shots": shots, "points": points}])
     )
-    rows = [f"{i}.jpg\t{j}\t{k}\t{x / 1000}\t{y / 1000}\t1\t2\t3" for k, (i, j, x, y) in enumerate(_views())]
+    rows = [
+        f"{i}.jpg\t{j}\t{k}\t{x / 1000}\t{y / 1000}\t1\t2\t3"
+        for k, (i, j, x, y) in enumerate(_views())
+    ]
     (folder / "tracks.csv").write_text("\n".join(rows) + "\n")
 
 
@@ -88,14 +104,20 @@ def _kitti(folder: Path) -> None:
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.uniform(0, 255, (600, 600)), (0, 0), 1.5)
     texture = np.clip(128 + 4 * (texture - 128), 0, 255).astype(np.uint8)
-    calibration = np.array([[FOCAL, 0, IMAGE_SIZE[0] / 2], [0, FOCAL, IMAGE_SIZE[1] / 2], [0, 0, 1]])
-    plane = np.array([[0.02, 0, -6.0], [0, 0.02, -6.0], [0.008, 0.004, 2.4]])  # from texture to camera 0
+    calibration = np.array(
+        [[FOCAL, 0, IMAGE_SIZE[0] / 2], [0, FOCAL, IMAGE_SIZE[1] / 2], [0, 0, 1]]
+    )
+    # from texture to camera 0
+    plane = np.array([[0.02, 0, -6.0], [0, 0.02, -6.0], [0.008, 0.004, 2.4]])
     (folder / "image_0").mkdir(parents=True)
     poses = []
     for frame in range(IMAGES):
         center = np.array([0.4, 0.1, 1.0]) * SPEED * frame
         homography = calibration @ (plane - np.outer(center, [0, 0, 1]))
-        cv2.imwrite(str(folder / "image_0" / f"{frame:06d}.png"), cv2.warpPerspective(texture, homography, IMAGE_SIZE))
+        cv2.imwrite(
+            str(folder / "image_0" / f"{frame:06d}.png"),
+            cv2.warpPerspective(texture, homography, IMAGE_SIZE),
+        )
         poses.append(" ".join(f"{x:.9e}" for x in np.column_stack([np.eye(3), center]).ravel()))
     row = " ".join(f"{x:.9e}" for x in np.column_stack([calibration, np.zeros(3)]).ravel())
     (folder / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k in range(4)))
@@ -117,8 +139,12 @@ def _solved(name: str, make: Callable[[Path], None], file: str, weight: int = 1)
     return Input(name, make, "solve", (f"IN/{file}", *SOLVE), weight)
 
 
-def _read(name: str, kind: configurations.Kind, configuration: str, option: str, weight: int) -> Input:
-    make = lambda folder: (folder / "a.yaml").write_bytes(configurations.find(kind, configuration).read_bytes())
+def _read(
+    name: str, kind: configurations.Kind, configuration: str, option: str, weight: int
+) -> Input:
+    make = lambda folder: (folder / "a.yaml").write_bytes(
+        configurations.find(kind, configuration).read_bytes()
+    )
     return Input(name, make, kind, (option, "IN/a.yaml", "--out", "OUT/run"), weight)
 
 
@@ -146,10 +172,26 @@ INPUTS = (
         "KITTI",
         _kitti,
         "kitti",
-        ("IN", "--poses", "IN/poses.txt", "--start", "poses", "--keyframes", "all", "--out", "OUT/o.txt"),
+        (
+            "IN",
+            "--poses",
+            "IN/poses.txt",
+            "--start",
+            "poses",
+            "--keyframes",
+            "all",
+            "--out",
+            "OUT/o.txt",
+        ),
         3,
     ),
-    Input("policy file", _policy, "solve", ("IN/../scene.txt", "--policy", "IN/a.safetensors", *SOLVE), 3),
+    Input(
+        "policy file",
+        _policy,
+        "solve",
+        ("IN/../scene.txt", "--policy", "IN/a.safetensors", *SOLVE),
+        3,
+    ),
     _read("configuration of a training", "train", "default", "--config", 3),
     _read("configuration of a benchmark", "bench", "synthetic", "--suite", 2),
 )

@@ -1,15 +1,15 @@
 """Seconds of an iteration and memory by the number of observations, from 30 thousand to 29 million.
 
-    python -m benchmarks.growth [--sizes 30,100,300,1000,3000,9125,28988] [--devices 1] [--figure FILE.png]
-    python -m benchmarks.growth --sizes 28988 --policy guarded --iterations 100
-    python -m benchmarks.growth --sizes 1000,3000,5000 --policy guarded --iterations 100 --ceres 5000
+    python -m benchmarks.growth [--sizes 30,100,300,1000,3000,9125,28988] [--devices 1] [--figure
+    FILE.png] python -m benchmarks.growth --sizes 28988 --policy guarded --iterations 100 python -m
+    benchmarks.growth --sizes 1000,3000,5000 --policy guarded --iterations 100 --ceres 5000
 
-Random scenes with the proportions of BAL's Final-13682: 2,119 observations an image, 6.5 a point; the largest has its
-counts. Each is a process of its own, solved with the implicit solver, by default by the rule `ceres` for a few
-iterations; memory is its largest resident set. With `JAXBA_CERES` Ceres' iterative mode solves those up to `--ceres`,
-too, with as many iterations. `to_end_s` and `ceres_to_end_s` are seconds until the cost is within 1e-3 of the lower of
-both ends, without set-up and compilation. Sizes are in thousands of observations.
-"""
+Random scenes with the proportions of BAL's Final-13682: 2,119 observations an image, 6.5 a point;
+the largest has its counts. Each is a process of its own, solved with the implicit solver, by
+default by the rule `ceres` for a few iterations; memory is its largest resident set. With
+`JAXBA_CERES` Ceres' iterative mode solves those up to `--ceres`, too, with as many iterations.
+`to_end_s` and `ceres_to_end_s` are seconds until the cost is within 1e-3 of the lower of both ends,
+without set-up and compilation. Sizes are in thousands of observations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ def scene(observations: int) -> Any:
 
     images, points = (round(count * observations / OBSERVATIONS) for count in (IMAGES, POINTS))
     images = max(10, images)
-    return jaxba.random_scene(jaxba.SceneConfig(cameras=images, points=points, observations=observations), seed=0)
+    return jaxba.random_scene(
+        jaxba.SceneConfig(cameras=images, points=points, observations=observations), seed=0
+    )
 
 
 def measure(observations: int, args: argparse.Namespace) -> dict[str, Any]:
@@ -67,7 +69,9 @@ def measure(observations: int, args: argparse.Namespace) -> dict[str, Any]:
         times.append(record.time_s)
 
     started = time.perf_counter()
-    found = jaxba.solve(problem, args.policy, options, callback=None if args.iterations == ITERATIONS else note)
+    found = jaxba.solve(
+        problem, args.policy, options, callback=None if args.iterations == ITERATIONS else note
+    )
     return {
         "observations": problem.num_observations,
         "images": problem.num_cameras,
@@ -103,13 +107,17 @@ def ceres(observations: int, iterations: int) -> peers.CeresRun | None:
 
 def main() -> None:
     """Prints a row for every size, and draws them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sizes", default="30,100,300,1000,3000,9125,28988")
     parser.add_argument("--devices", type=int, default=1)
     parser.add_argument("--policy", default="ceres")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--dtype", default="float64")
-    parser.add_argument("--ceres", type=float, default=1000, help="largest size that Ceres solves, too")
+    parser.add_argument(
+        "--ceres", type=float, default=1000, help="largest size that Ceres solves, too"
+    )
     parser.add_argument("--figure")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -121,13 +129,19 @@ def main() -> None:
     passed = [word for name in names for word in (f"--{name}", str(getattr(args, name)))]
     for size in (min(OBSERVATIONS, round(1000 * float(size))) for size in args.sizes.split(",")):
         command = [sys.executable, "-m", "benchmarks.growth", "--one", str(size), *passed]
-        row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+        row = json.loads(
+            subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[
+                -1
+            ]
+        )
         peer = ceres(size, args.iterations) if size <= 1000 * args.ceres else None
         costs, times = row.pop("costs"), row.pop("times")
         row["ceres_s"] = peer and peer.seconds_per_iteration
         if peer and costs:
             goal = (1 + WITHIN) * min(*costs, *peer.costs)
-            row["to_end_s"] = next((t for t, cost in zip(times, costs, strict=True) if cost <= goal), None)
+            row["to_end_s"] = next(
+                (t for t, cost in zip(times, costs, strict=True) if cost <= goal), None
+            )
             row |= {"ceres_to_end_s": peer.seconds_to(goal), "ceres_final_cost": peer.final_cost}
             row |= {"ceres_all_s": peer.total_s, "ceres_iterations": peer.iterations}
         rows.append(row)
@@ -142,7 +156,9 @@ def _draw(rows: list[dict[str, Any]], path: str) -> None:
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
     x = [row["observations"] for row in rows]
-    axes.loglog(x, [row["iteration_s"] for row in rows], "o-", label="jaxba, implicit: seconds an iteration")
+    axes.loglog(
+        x, [row["iteration_s"] for row in rows], "o-", label="jaxba, implicit: seconds an iteration"
+    )
     peer = [(row["observations"], row["ceres_s"]) for row in rows if row["ceres_s"]]
     if peer:
         axes.loglog(*zip(*peer, strict=True), "s--", label="C++ Ceres, iterative Schur")

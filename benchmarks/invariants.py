@@ -1,13 +1,14 @@
-"""Solves thousands of random scenes with every damping rule and checks what must hold of every iteration.
+"""Solves thousands of random scenes with every damping rule and checks what must hold of every
+iteration.
 
     python -m benchmarks.invariants --scenes 10000 --seed 0
 
-No cost rises, no number of a state is not finite, no focal length changes its sign, lambda is positive, and the last
-cost is that of the last parameters, evaluated anew. Iterations go on after convergence, where costs differ by rounding
-alone. Scenes are those of the game before any selection (`jaxba/game/random_scenes.py`), in equal parts of every
-family, wrong matches, bad starts and scenes that nobody observes included. A start whose cost is not finite is left out
-and counted, since `solve` refuses it.
-"""
+No cost rises, no number of a state is not finite, no focal length changes its sign, lambda is
+positive, and the last cost is that of the last parameters, evaluated anew. Iterations go on after
+convergence, where costs differ by rounding alone. Scenes are those of the game before any selection
+(`jaxba/game/random_scenes.py`), in equal parts of every family, wrong matches, bad starts and
+scenes that nobody observes included. A start whose cost is not finite is left out and counted,
+since `solve` refuses it."""
 
 from __future__ import annotations
 
@@ -109,7 +110,9 @@ def solve_all(
             found, policy_state, damping = carry
             before = found.state
             state, step = lm_step(seen, before, damping, options, policy.min_gain, number)
-            finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in state[:3]])
+            finite = functools.reduce(
+                jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in state[:3]]
+            )
             policy_state, after = policy.propose(policy_state, step)
             found = Found(
                 found.rises | ~(state.cost <= before.cost),
@@ -128,8 +131,11 @@ def solve_all(
     return step_groups(solve, scenes, costs, info)
 
 
-def count_violations(kind: SceneClass, scenes: Scenes, name: str, iterations: int) -> tuple[dict[str, int], float, int]:
-    """Scenes that violate each invariant, the median of last over first costs, and the number of scenes.
+def count_violations(
+    kind: SceneClass, scenes: Scenes, name: str, iterations: int
+) -> tuple[dict[str, int], float, int]:
+    """Scenes that violate each invariant, the median of last over first costs, and the number of
+    scenes.
 
     Args:
         kind: class of the scenes.
@@ -140,11 +146,15 @@ def count_violations(kind: SceneClass, scenes: Scenes, name: str, iterations: in
     policy, options = parse_solver(name).build()
     costs = initial_costs(kind, scenes)
     step = options.step_options(policy)
-    found = solve_all(kind, scenes, costs, info_of(kind, scenes, costs, iterations), policy, step, iterations)
+    found = solve_all(
+        kind, scenes, costs, info_of(kind, scenes, costs, iterations), policy, step, iterations
+    )
     ends = scenes._replace(cameras=found.state.cameras, points=found.state.points)
     anew, last = np.asarray(initial_costs(kind, ends)), np.asarray(found.state.cost)
     counts = {field: int(np.sum(getattr(found, field))) for field in Found._fields[:-1]}
-    pixels = np.linalg.norm(np.where(np.asarray(scenes.mask)[:, None], scenes.pixels, 0), axis=(1, 2))
+    pixels = np.linalg.norm(
+        np.where(np.asarray(scenes.mask)[:, None], scenes.pixels, 0), axis=(1, 2)
+    )
     bound = COST_TOLERANCE * np.sqrt(last) + PIXEL_ROUNDING * pixels
     counts["wrong_cost"] = int(np.sum(~(np.abs(np.sqrt(anew) - np.sqrt(last)) <= bound)))
     first = np.asarray(costs)
@@ -165,17 +175,23 @@ def main(argv: Sequence[str] | None = None) -> int:
             usable = np.flatnonzero(np.isfinite(initial_costs(kind, scenes)))
             scenes = jax.tree.map(lambda x, usable=usable: x[usable], scenes)
             print(
-                f"{family}: {len(usable)} scenes, {count - len(usable)} more whose first cost is not finite", flush=True
+                f"{family}: {len(usable)} scenes, {count - len(usable)} more whose first cost is "
+                "not finite",
+                flush=True,
             )
             for name in args.solvers.split(","):
                 started = time.perf_counter()
                 counts, ratio, solved = count_violations(kind, scenes, name, args.iterations)
                 for field, violations in counts.items():
                     total[field] += violations
-                bad = ", ".join(f"{n} {NAMES[field]}" for field, n in counts.items() if n) or "everything holds"
+                bad = (
+                    ", ".join(f"{n} {NAMES[field]}" for field, n in counts.items() if n)
+                    or "everything holds"
+                )
                 seconds = time.perf_counter() - started
                 print(
-                    f"  {name}: {solved * args.iterations} iterations, cost x{ratio:.2g}, {bad}, {seconds:.0f} s",
+                    f"  {name}: {solved * args.iterations} iterations, cost x{ratio:.2g}, {bad}, "
+                    f"{seconds:.0f} s",
                     flush=True,
                 )
     print("; ".join(f"{count} {NAMES[field]}" for field, count in total.items()))

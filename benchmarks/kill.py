@@ -1,13 +1,14 @@
-"""Kills trainings at random moments, resumes them, and compares the end with that of a training that ran through.
+"""Kills trainings at random moments, resumes them, and compares the end with that of a training
+that ran through.
 
     python -m benchmarks.kill --times 100 --seed 0
 
-A training is `jaxba-train` on few small scenes, in a process of its own that is ended by SIGKILL (on Windows:
-TerminateProcess): after one of the lines that it prints, drawn uniformly, and a part, drawn uniformly too, of the time
-that an unbroken training takes from that line to the next. So most kills fall between two chunks of training, into
-evaluations and the writing of log, policy and checkpoints. After some kills a training is left to end. Its policy file
-must then be the same byte by byte, and its log but for the clocks.
-"""
+A training is `jaxba-train` on few small scenes, in a process of its own that is ended by SIGKILL
+(on Windows: TerminateProcess): after one of the lines that it prints, drawn uniformly, and a part,
+drawn uniformly too, of the time that an unbroken training takes from that line to the next. So most
+kills fall between two chunks of training, into evaluations and the writing of log, policy and
+checkpoints. After some kills a training is left to end. Its policy file must then be the same byte
+by byte, and its log but for the clocks."""
 
 from __future__ import annotations
 
@@ -29,10 +30,25 @@ from jaxba.training.driver import CHECKPOINTS, CONFIG
 
 SETTINGS = [
     *("chunks=48", "evaluate_every=1", "envs=8"),
-    *("bank.kind={cameras: 4, points: 12, family: paper}", "bank.scenes=160", "bank.refine_points=0"),
-    *("game.max_iterations=12", "game.agent.refine_points=0", "game.agent.trials=1", "game.agent.camera_rounds=0"),
+    *(
+        "bank.kind={cameras: 4, points: 12, family: paper}",
+        "bank.scenes=160",
+        "bank.refine_points=0",
+    ),
+    *(
+        "game.max_iterations=12",
+        "game.agent.refine_points=0",
+        "game.agent.trials=1",
+        "game.agent.camera_rounds=0",
+    ),
     "game.agent.pattern_moves=0",
-    *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),
+    *(
+        "sac.width=8",
+        "sac.batch=16",
+        "loop.replay_capacity=500",
+        "loop.warmup_steps=16",
+        "loop.steps_per_chunk=8",
+    ),
 ]
 """A training of seconds, with a checkpoint after every chunk."""
 
@@ -62,7 +78,8 @@ class Arguments:
 
 
 class Trainings:
-    """Trainings with one configuration in folders of their own; compiled programs are kept between processes."""
+    """Trainings with one configuration in folders of their own; compiled programs are kept between
+    processes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -71,11 +88,20 @@ class Trainings:
     def begin(self, run: Path) -> subprocess.Popen[str]:
         """Starts a training, or resumes what is in its folder."""
         arguments = ["--out", str(run)]
-        arguments += ["--resume"] if (run / CONFIG).is_file() else ["--config", "default", "--set", *SETTINGS]
+        arguments += (
+            ["--resume"]
+            if (run / CONFIG).is_file()
+            else ["--config", "default", "--set", *SETTINGS]
+        )
         command = [sys.executable, "-c", COMMAND, *arguments]
         pipe, both = subprocess.PIPE, subprocess.STDOUT
         return subprocess.Popen(
-            command, env=self.environment, text=True, start_new_session=True, stdout=pipe, stderr=both
+            command,
+            env=self.environment,
+            text=True,
+            start_new_session=True,
+            stdout=pipe,
+            stderr=both,
         )
 
     def finish(self, run: Path) -> list[float]:
@@ -95,7 +121,8 @@ class Trainings:
         return times
 
     def kill(self, run: Path, lines: int, after_s: float) -> bool:
-        """Starts a training and kills it some seconds after it has printed so many lines; false if it had ended before.
+        """Starts a training and kills it some seconds after it has printed so many lines; false if
+        it had ended before.
 
         Raises:
             RuntimeError: it had failed before, with what it printed.
@@ -138,19 +165,30 @@ def main(argv: Sequence[str] | None = None) -> int:
             run, runs = Path(name) / f"run-{runs}", runs + 1
             for _ in range(min(args.per_run, args.times - kills)):
                 left = last - max(checkpoint.steps(run / CHECKPOINTS), default=0)
-                line = int(rng.integers(FEWEST_LINES + (len(times) - FEWEST_LINES - 1) * left // last))
+                line = int(
+                    rng.integers(FEWEST_LINES + (len(times) - FEWEST_LINES - 1) * left // last)
+                )
                 if not trainings.kill(run, line, rng.uniform() * (times[line + 1] - times[line])):
                     break  # less was left
                 kills += 1
                 done = max(checkpoint.steps(run / CHECKPOINTS), default=0)
-                stages["between chunks" if 0 < done < last else "at the end" if done else "before a checkpoint"] += 1
+                stages[
+                    "between chunks"
+                    if 0 < done < last
+                    else "at the end"
+                    if done
+                    else "before a checkpoint"
+                ] += 1
             trainings.finish(run)
             if result(run) != expected:
                 print(f"run {runs} ended differently, seed {args.seed}")
                 return 1
             print(f"{kills} kills, {runs} trainings: as the unbroken one", flush=True)
         places = ", ".join(f"{count} {place}" for place, count in stages.items())
-        print(f"{kills} kills of {runs} trainings, seed {args.seed}: policies and logs are those of an unbroken one")
+        print(
+            f"{kills} kills of {runs} trainings, seed {args.seed}: policies and logs are those of "
+            "an unbroken one"
+        )
         print(f"({places}; an unbroken training takes {times[-1]:.1f} s)")
     return 0
 

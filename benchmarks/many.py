@@ -1,13 +1,14 @@
-"""Problems a second: thousands of windows of real problems by `jaxba.solve_many`, beside C++ Ceres and one by one.
+"""Problems a second: thousands of windows of real problems by `jaxba.solve_many`, beside C++ Ceres
+and one by one.
 
     python -m benchmarks.many [--count 10000] [--peers 300]
 
-`JAXBA_DATA` names the folder of real problems, and `JAXBA_CERES` the program with C++ Ceres (benchmarks/README.md).
-Windows are neighbouring cameras, 5 to 20 of them, with 50 to 500 of the points that they share, of BAL's and KITTI's
-problems; half of them disturbed by 0.3 degrees. Ceres is timed on `--peers` of them by its own clock (without start and
-reading), one thread a problem, and counted as two processes; DENSE_SCHUR, up to 100 iterations and `ftol` as ours. So
-is pycolmap, without reading.
-"""
+`JAXBA_DATA` names the folder of real problems, and `JAXBA_CERES` the program with C++ Ceres
+(benchmarks/README.md). Windows are neighbouring cameras, 5 to 20 of them, with 50 to 500 of the
+points that they share, of BAL's and KITTI's problems; half of them disturbed by 0.3 degrees. Ceres
+is timed on `--peers` of them by its own clock (without start and reading), one thread a problem,
+and counted as two processes; DENSE_SCHUR, up to 100 iterations and `ftol` as ours. So is pycolmap,
+without reading."""
 
 from __future__ import annotations
 
@@ -117,7 +118,8 @@ def pycolmap_seconds(problems: list[BundleProblem]) -> list[float]:
 
 
 def mapped_rate(problems: list[BundleProblem], policy: str) -> float:
-    """Problems a second of `jax.vmap` over solves padded to the largest, `MAPPED` at a time, compiled before."""
+    """Problems a second of `jax.vmap` over solves padded to the largest, `MAPPED` at a time,
+    compiled before."""
     sizes = [Sizes.of(one)[:4] for one in problems]
     capacity = Sizes._make([*np.max(sizes, axis=0).tolist(), 0]).capacity
     setups = [set_up(one, policy, capacity=capacity) for one in problems]
@@ -125,11 +127,16 @@ def mapped_rate(problems: list[BundleProblem], policy: str) -> float:
 
     def solved(layout: jaxba.Layout, cameras: jax.Array, points: jax.Array) -> jax.Array:
         state = state_of(layout, cameras, points, options, np.float64)
-        return jaxba.solve_loop(layout, state, setups[0].policy, tolerances, options, 100)[0].state.cost
+        return jaxba.solve_loop(layout, state, setups[0].policy, tolerances, options, 100)[
+            0
+        ].state.cost
 
     program = jit(jax.vmap(solved))
     batches = [setups[at : at + MAPPED] for at in range(0, len(setups) - MAPPED + 1, MAPPED)]
-    given = [jax.tree.map(lambda *x: np.stack(x), *[(one.layout, *one.start) for one in batch]) for batch in batches]
+    given = [
+        jax.tree.map(lambda *x: np.stack(x), *[(one.layout, *one.start) for one in batch])
+        for batch in batches
+    ]
     with numerics(np.float64):
         jax.block_until_ready(program(*given[0]))
         began = time.perf_counter()
@@ -140,14 +147,19 @@ def mapped_rate(problems: list[BundleProblem], policy: str) -> float:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--peers", type=int, default=300)
     parser.add_argument("--policy", default="guarded")
     args = parser.parse_args()
     problems = list(windows(args.count))
     observations = np.array([one.num_observations for one in problems])
-    print(f"{len(problems)} windows, {observations.mean():.0f} observations, median {np.median(observations):.0f}")
+    print(
+        f"{len(problems)} windows, {observations.mean():.0f} observations, median "
+        f"{np.median(observations):.0f}"
+    )
     few = problems[: args.peers]
     seconds, costs = ceres_seconds(few)
     if seconds:
@@ -163,7 +175,10 @@ def main() -> None:
     solved = [one for one in found if not isinstance(one, Exception)]
     half = len(times) // 2
     steady = (len(times) - half) / (times[-1] - times[half - 1])
-    print(f"solve_many: {len(times) / times[-1]:.1f} a second, {steady:.1f} in the second half, first {times[0]:.1f} s")
+    print(
+        f"solve_many: {len(times) / times[-1]:.1f} a second, {steady:.1f} in the second half, "
+        f"first {times[0]:.1f} s"
+    )
     cells = {one.capacity for one in solved if one.capacity is not None and one.capacity.fixed}
     sizes = np.array([Sizes.of(one)[:4] for one in problems])
     cell = np.array(
@@ -183,14 +198,24 @@ def main() -> None:
     began = time.perf_counter()
     for problem in few[:100]:
         alone.append(jaxba.solve(problem, args.policy, options))
-    print(f"solve, one by one, compilation included: {100 / (time.perf_counter() - began):.1f} a second")
-    print(f"vmap of {MAPPED}, without refilling or compilation: {mapped_rate(few[:64], args.policy):.1f} a second")
+    print(
+        f"solve, one by one, compilation included: {100 / (time.perf_counter() - began):.1f} a "
+        "second"
+    )
+    print(
+        f"vmap of {MAPPED}, without refilling or compilation: "
+        f"{mapped_rate(few[:64], args.policy):.1f} a second"
+    )
     above = np.array([a.final_cost / b.final_cost - 1 for a, b in zip(found, alone, strict=False)])
-    print(f"end beside a solve alone: within 1e-6 in {np.mean(abs(above) < 1e-6):.0%}, largest {above.max():.1e}")
+    print(
+        f"end beside a solve alone: within 1e-6 in {np.mean(abs(above) < 1e-6):.0%}, largest "
+        f"{above.max():.1e}"
+    )
     if costs:
         above = np.array([a.final_cost / b - 1 for a, b in zip(found, costs, strict=False)])
         print(
-            f"end beside Ceres': lower by 1e-4 in {np.mean(above < -1e-4):.0%}, higher in {np.mean(above > 1e-4):.0%}"
+            f"end beside Ceres': lower by 1e-4 in {np.mean(above < -1e-4):.0%}, higher in "
+            f"{np.mean(above > 1e-4):.0%}"
         )
 
 

@@ -33,7 +33,8 @@ class Metric:
 
     @property
     def gated(self) -> bool:
-        """Whether it is compared with the baseline. Only ratios are, since seconds depend on the machine."""
+        """Whether it is compared with the baseline. Only ratios are, since seconds depend on the
+        machine."""
         return self.unit == "ratio"
 
     @property
@@ -53,7 +54,9 @@ def regressions(metrics: Iterable[Metric], baseline: dict[str, float]) -> list[s
             continue
         worse = metric.value / before if metric.direction == "lower" else before / metric.value
         if worse > 1 + metric.tolerance:
-            found.append(f"{metric.key}: {metric.value:.3g}, baseline {before:.3g} ({worse - 1:+.0%})")
+            found.append(
+                f"{metric.key}: {metric.value:.3g}, baseline {before:.3g} ({worse - 1:+.0%})"
+            )
     return found
 
 
@@ -63,14 +66,19 @@ def read_baseline(path: Path) -> dict[str, float]:
 
 
 def write_baseline(path: Path, metrics: Iterable[Metric]) -> None:
-    """Replaces the ratios in the baseline by those of this run, and keeps those that were not measured."""
+    """Replaces the ratios in the baseline by those of this run, and keeps those that were not
+    measured."""
     ratios = {m.key: round(m.value, 4) for m in metrics if m.gated}
-    path.write_text(json.dumps(dict(sorted({**read_baseline(path), **ratios}.items())), indent=1) + "\n")
+    path.write_text(
+        json.dumps(dict(sorted({**read_baseline(path), **ratios}.items())), indent=1) + "\n"
+    )
 
 
 def to_json(metrics: Iterable[Metric], machine: dict[str, str]) -> str:
     """The metrics and a description of the machine as a JSON document."""
-    return json.dumps({"machine": machine, "metrics": [asdict(m) for m in metrics]}, indent=1) + "\n"
+    return (
+        json.dumps({"machine": machine, "metrics": [asdict(m) for m in metrics]}, indent=1) + "\n"
+    )
 
 
 def to_text(metrics: Iterable[Metric]) -> str:

@@ -1,9 +1,10 @@
-"""BAL's projection as a user's residual beside the built-in one: costs, milliseconds an iteration, compilation.
+"""BAL's projection as a user's residual beside the built-in one: costs, milliseconds an iteration,
+compilation.
 
     python -m benchmarks.own_residual FILE ...
 
-Both solve the same problem with Ceres' rule, fully compiled, on this machine; a row is the better of three solves.
-"""
+Both solve the same problem with Ceres' rule, fully compiled, on this machine; a row is the better
+of three solves."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ import numpy as np
 import jaxba
 from jaxba.runtime import process
 
-OPTIONS = jaxba.SolveOptions(compilation="full", pad=False, max_iterations=12, linear_solver="explicit")
+OPTIONS = jaxba.SolveOptions(
+    compilation="full", pad=False, max_iterations=12, linear_solver="explicit"
+)
 
 
 @jaxba.residual
@@ -46,16 +49,21 @@ def measured(problem: jaxba.BundleProblem) -> tuple[float, float, float]:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("files", nargs="+")
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()
     for path in parser.parse_args().files:
         problem = jaxba.read_problem(path)
-        (cost, compiled, built_in), (own_cost, own_compiled, own) = map(measured, (problem, as_residuals(problem)))
+        (cost, compiled, built_in), (own_cost, own_compiled, own) = map(
+            measured, (problem, as_residuals(problem))
+        )
         print(
             f"{path}: costs {abs(own_cost / cost - 1):.1e} apart, "
-            f"an iteration {1e3 * built_in:.1f} and {1e3 * own:.1f} ms, ratio {own / built_in:.2f}; "
+            f"an iteration {1e3 * built_in:.1f} and {1e3 * own:.1f} ms, ratio "
+            f"{own / built_in:.2f}; "
             f"compilation {compiled:.1f} and {own_compiled:.1f} s"
         )
 

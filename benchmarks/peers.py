@@ -1,9 +1,9 @@
 """Runs a program that solves a BAL file with C++ Ceres.
 
-The environment variable `JAXBA_CERES` names the program. Its arguments are `FILE --linear MODE --threads N --max_iter
-K`. Its last line of output is a JSON object with `iterations`, `initial_cost`, `final_cost`, `total_s` and the lists
-`costs` and `times` (seconds of each iteration; the first entry is the start).
-"""
+The environment variable `JAXBA_CERES` names the program. Its arguments are `FILE --linear MODE
+--threads N --max_iter K`. Its last line of output is a JSON object with `iterations`,
+`initial_cost`, `final_cost`, `total_s` and the lists `costs` and `times` (seconds of each
+iteration; the first entry is the start)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MODES = ("DENSE_SCHUR", "SPARSE_SCHUR", "ITERATIVE_SCHUR")
-"""Ceres' linear solvers for bundle adjustment; the iterative one uses the preconditioner SCHUR_JACOBI."""
+"""Ceres' linear solvers for bundle adjustment; the iterative one uses the preconditioner
+SCHUR_JACOBI."""
 
 VARIABLE = "JAXBA_CERES"
 """Environment variable with the path of the program."""
@@ -53,7 +54,9 @@ def program() -> Path | None:
     return Path(name) if name and Path(name).is_file() else None
 
 
-def run(binary: Path, file: Path, mode: str, threads: int, max_iterations: int, limit_s: float = 600) -> CeresRun:
+def run(
+    binary: Path, file: Path, mode: str, threads: int, max_iterations: int, limit_s: float = 600
+) -> CeresRun:
     """Solves an uncompressed BAL file with Ceres.
 
     Args:
@@ -64,7 +67,16 @@ def run(binary: Path, file: Path, mode: str, threads: int, max_iterations: int, 
         max_iterations: limit of iterations.
         limit_s: limit of the time in seconds, after which `subprocess.TimeoutExpired` is raised.
     """
-    command = [str(binary), str(file), "--linear", mode, "--threads", str(threads), "--max_iter", str(max_iterations)]
+    command = [
+        str(binary),
+        str(file),
+        "--linear",
+        mode,
+        "--threads",
+        str(threads),
+        "--max_iter",
+        str(max_iterations),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s, check=True)
     data = json.loads(done.stdout.strip().splitlines()[-1].replace("nan", "NaN"))
     return CeresRun(

@@ -1,10 +1,11 @@
 """Time of each phase of an LM step, compared with the limit by memory bandwidth.
 
-    python -m benchmarks.phases PROBLEM [--solver explicit|sparse|implicit] [--refine 3] [--repeats 30]
+    python -m benchmarks.phases PROBLEM [--solver explicit|sparse|implicit] [--refine 3] [--repeats
+    30]
 
-PROBLEM is a file or a random scene (`scene:random-150`). `bound` is the time to move the inputs and outputs of a phase
-once with the measured bandwidth of a copy; `bound/min` is that over the shortest measured time.
-"""
+PROBLEM is a file or a random scene (`scene:random-150`). `bound` is the time to move the inputs and
+outputs of a phase once with the measured bandwidth of a copy; `bound/min` is that over the shortest
+measured time."""
 
 from __future__ import annotations
 
@@ -81,10 +82,15 @@ class Phase(NamedTuple):
         return f"{self.name:14s} {times} {self.bound_s / self.least_s:9.0%} {self.compile_s:9.2f}"
 
 
-HEADING = f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'bound ms':>9s} {'bound/min':>9s} {'compile s':>9s}"
+HEADING = (
+    f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'bound ms':>9s} {'bound/min':>9s} "
+    f"{'compile s':>9s}"
+)
 
 
-def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: float, repeats: int) -> Iterator[Phase]:
+def measure(
+    layout: Layout, problem: BundleProblem, options: StepOptions, rate: float, repeats: int
+) -> Iterator[Phase]:
     """Times each phase of a step as a separately compiled program, then complete steps.
 
     Args:
@@ -97,8 +103,8 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     done: dict[str, Any] = {}
 
     def phase(name: str, function: Any, *arguments: Any) -> Phase:
-        """Times a function of the layout and other arguments. The layout must be an argument, as in a step, since XLA
-        would compile its index arrays differently as constants."""
+        """Times a function of the layout and other arguments. The layout must be an argument, as in
+        a step, since XLA would compile its index arrays differently as constants."""
         done[name], least, median, compile_s = timed(function, layout, *arguments, repeats=repeats)
         return Phase(name, least, median, (size(arguments) + size(done[name])) / rate, compile_s)
 
@@ -107,15 +113,21 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     damping = jnp.asarray(1e-4)
     yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
-    system_of = lambda la, li, s: schur.DampedSystem.of(la, li, s.cameras, s.points, damping, plain)[2:4]
-    yield phase("eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping)
+    system_of = lambda la, li, s: schur.DampedSystem.of(
+        la, li, s.cameras, s.points, damping, plain
+    )[2:4]
+    yield phase(
+        "eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping
+    )
     yield phase("eliminate, sum", system_of, linear, state)
     points, system = done["eliminate, sum"]
 
     def whole(la: Layout, li: Any, po: Any, sy: Any, s: Any) -> schur.DampedSystem:
         rotation = schur.rotation_coordinates(s.cameras, plain)
         at = s.cameras, s.points
-        return schur.DampedSystem(la, li, po, sy, damping, at, rotation, plain.conjugate_gradients.forcing)
+        return schur.DampedSystem(
+            la, li, po, sy, damping, at, rotation, plain.conjugate_gradients.forcing
+        )
 
     parts = linear, points, system, state
     if layout.grid is not None:
@@ -129,21 +141,35 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
         name = "factor" if direct else "one product"
         yield phase(name, lambda la, b, x: solve(la, b, x), done["form"], system.right)
     else:
-        yield phase("one product", lambda *parts: schur.apply_reduced(whole(*parts), parts[3].right), *parts)
+        yield phase(
+            "one product", lambda *parts: schur.apply_reduced(whole(*parts), parts[3].right), *parts
+        )
     if plain.uses_camera_clusters:
         coarse = lambda *parts: coarse_preconditioner(whole(*parts))(parts[3].right)
         yield phase("coarse system", coarse, *parts)
-    yield phase("reduced solve", lambda *parts: reduced_system.solve_reduced(whole(*parts), plain), *parts)
-    yield phase("back-substitute", lambda *parts: schur.back_substitute(whole(*parts), parts[3].right), *parts)
+    yield phase(
+        "reduced solve", lambda *parts: reduced_system.solve_reduced(whole(*parts), plain), *parts
+    )
+    yield phase(
+        "back-substitute",
+        lambda *parts: schur.back_substitute(whole(*parts), parts[3].right),
+        *parts,
+    )
     yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
     count = options.refinement.points
     if count:
-        refine = lambda la, s: refine_points(la, s.cameras, slot_frames(la, s.cameras), s.points, plain.loss, count)
+        refine = lambda la, s: refine_points(
+            la, s.cameras, slot_frames(la, s.cameras), s.points, plain.loss, count
+        )
         yield phase(f"refine {count}", refine, state)
-        yield phase("refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), state)
+        yield phase(
+            "refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), state
+        )
     yield phase("whole step", lambda la, s: step.lm_step(la, s, damping, plain), state)
     if count:
-        yield phase(f"step, refine {count}", lambda la, s: step.lm_step(la, s, damping, options), state)
+        yield phase(
+            f"step, refine {count}", lambda la, s: step.lm_step(la, s, damping, options), state
+        )
 
 
 def main() -> None:
@@ -160,8 +186,14 @@ def main() -> None:
     options = StepOptions(linear_solver=args.solver, refinement=Refinement(points=args.refine))
     started = time.perf_counter()
     arrays = build_layout(problem, options)
-    print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
-    print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} slots")
+    print(
+        f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} "
+        "observations"
+    )
+    print(
+        f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} "
+        "slots"
+    )
     rate = bandwidth()
     print(f"copy bandwidth {rate / 1e9:.1f} GB/s, device {jax.devices()[0].device_kind}")
     print(HEADING)

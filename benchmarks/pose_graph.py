@@ -1,12 +1,13 @@
-"""Pose graphs beside GTSAM and Ceres: final costs, and milliseconds an iteration with residuals of C++ and of Python.
+"""Pose graphs beside GTSAM and Ceres: final costs, and milliseconds an iteration with residuals of
+C++ and of Python.
 
     python -m benchmarks.pose_graph [--poses 1000] [--python 200] [--linear-solver auto]
 
-Needs gtsam and pyceres in the same Python. The graph is a walk on a sphere with loop closures between its rounds, of
-which each start is the sum of its noisy steps. All have GTSAM's error `Log(T_measured^-1 T_1^-1 T_2)`, rotation before
-translation, and take Levenberg-Marquardt steps to convergence. Functions in Python have derivatives by hand in GTSAM
-and Ceres, by JAX here; they are timed on `--python` poses. Compilation is not counted, and printed.
-"""
+Needs gtsam and pyceres in the same Python. The graph is a walk on a sphere with loop closures
+between its rounds, of which each start is the sum of its noisy steps. All have GTSAM's error
+`Log(T_measured^-1 T_1^-1 T_2)`, rotation before translation, and take Levenberg-Marquardt steps to
+convergence. Functions in Python have derivatives by hand in GTSAM and Ceres, by JAX here; they are
+timed on `--python` poses. Compilation is not counted, and printed."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ from jaxba.problem.options import LinearSolverChoice
 from jaxba.rotations import angle_axis, left_jacobian_inverse
 
 SIGMA = np.array([0.02] * 3 + [0.1] * 3)
-"""Standard deviations of a measured pose: radians, and units in which the sphere has a radius of 20."""
+"""Standard deviations of a measured pose: radians, and units in which the sphere has a radius of
+20."""
 
 AXES = np.array([1.0, -1.0, -1.0])
 """From the axes of COLMAP to those of BAL."""
@@ -77,7 +79,9 @@ def problem_of(graph: Graph) -> jaxba.BundleProblem:
     lens = np.tile([1.0, 0.0, 0.0], (len(rotation), 1))
     cameras = np.hstack([Rotation.from_matrix(rotation).as_rotvec(), translation, lens])
     problem = jaxba.hold(jaxba.BundleProblem.create(cameras), poses=[0])
-    rows = between(pose=graph.first, pose_2=graph.second, rotation=graph.turn, translation=graph.move)
+    rows = between(
+        pose=graph.first, pose_2=graph.second, rotation=graph.turn, translation=graph.move
+    )
     return jaxba.with_residual(problem, rows)
 
 
@@ -93,10 +97,16 @@ def with_jaxba(graph: Graph, linear_solver: LinearSolverChoice) -> tuple[float, 
     products = solutions[0].history.cg_iterations.sum() / solutions[0].iterations
     one = solutions[0]
     more = f"{one.iterations} iterations, {one.linear_solver}, {products:.0f} products each"
-    return one.final_cost, best, f"{more}; registration {registered:.1f} s, compilation {one.compile_s:.1f} s"
+    return (
+        one.final_cost,
+        best,
+        f"{more}; registration {registered:.1f} s, compilation {one.compile_s:.1f} s",
+    )
 
 
-def python_factor(model: gtsam.noiseModel.Base, measured: gtsam.Pose3, first: int, second: int) -> gtsam.CustomFactor:
+def python_factor(
+    model: gtsam.noiseModel.Base, measured: gtsam.Pose3, first: int, second: int
+) -> gtsam.CustomFactor:
     """The same factor, of a function in Python with derivatives by hand."""
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None) -> np.ndarray:
@@ -121,13 +131,21 @@ def with_gtsam(graph: Graph, in_python: bool) -> tuple[float, float, str]:
     """As `with_jaxba`."""
     model = gtsam.noiseModel.Diagonal.Sigmas(SIGMA)
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    poses = [gtsam.Pose3(gtsam.Rot3(r), p) for r, p in zip(graph.rotation, graph.position, strict=True)]
+    poses = [
+        gtsam.Pose3(gtsam.Rot3(r), p) for r, p in zip(graph.rotation, graph.position, strict=True)
+    ]
     for key, pose in enumerate(poses):
         values.insert(key, pose)
     factors.add(gtsam.NonlinearEqualityPose3(0, poses[0]))
-    for first, second, turn, move in zip(graph.first, graph.second, graph.turn, graph.move, strict=True):
+    for first, second, turn, move in zip(
+        graph.first, graph.second, graph.turn, graph.move, strict=True
+    ):
         measured = gtsam.Pose3(gtsam.Rot3(turn), move)
-        make = python_factor if in_python else lambda *x: gtsam.BetweenFactorPose3(x[2], x[3], x[1], x[0])
+        make = (
+            python_factor
+            if in_python
+            else lambda *x: gtsam.BetweenFactorPose3(x[2], x[3], x[1], x[0])
+        )
         factors.add(make(model, measured, int(first), int(second)))
     options = gtsam.LevenbergMarquardtParams()
     options.setRelativeErrorTol(1e-14)
@@ -159,7 +177,10 @@ class PythonCost(pyceres.CostFunction):
         if jacobians is not None:
             by_error = inverse_of_right_jacobian(twist) / SIGMA[:, None]
             for k, (pose, x, by) in enumerate(
-                [(one, parameters[0], -by_error @ found.inverse().AdjointMap()), (two, parameters[1], by_error)]
+                [
+                    (one, parameters[0], -by_error @ found.inverse().AdjointMap()),
+                    (two, parameters[1], by_error),
+                ]
             ):
                 if jacobians[k] is not None:
                     local = np.zeros((6, 6))
@@ -191,7 +212,9 @@ def with_ceres(graph: Graph) -> tuple[float, float, str]:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--poses", type=int, default=1000)
     parser.add_argument("--python", type=int, default=200)
     parser.add_argument("--linear-solver", default="auto")
@@ -202,7 +225,10 @@ def main() -> None:
         own = functools.partial(with_jaxba, linear_solver=arguments.linear_solver)
         runs = {"jaxba": own, "gtsam, C++": lambda graph: with_gtsam(graph, False)}
         if in_python:
-            runs |= {"gtsam, Python": lambda graph: with_gtsam(graph, True), "ceres, Python": with_ceres}
+            runs |= {
+                "gtsam, Python": lambda graph: with_gtsam(graph, True),
+                "ceres, Python": with_ceres,
+            }
         print(f"{count} poses, {len(graph.first)} relative poses")
         for name, run in runs.items():
             cost, seconds, more = run(graph)

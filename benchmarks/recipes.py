@@ -1,12 +1,13 @@
-"""Which recipes belong side by side: the ends of windows of real problems by each, and the order of `RECIPES`.
+"""Which recipes belong side by side: the ends of windows of real problems by each, and the order of
+`RECIPES`.
 
     python -m benchmarks.recipes [--choose 0 1] [--judge 2 3]
 
-`JAXBA_DATA` names the folder of real problems. Windows and disturbances are those of `benchmarks.default_policy`. Its
-draws `--choose` put the candidates in order, and `--judge` says what the first K are worth on windows that had no part
-in that. The first recipe is the default; each further one leaves the fewest windows more than 1e-4 above the best end
-of all, and among equals has the lowest mean of log10(end / best - 1 + 1e-6).
-"""
+`JAXBA_DATA` names the folder of real problems. Windows and disturbances are those of
+`benchmarks.default_policy`. Its draws `--choose` put the candidates in order, and `--judge` says
+what the first K are worth on windows that had no part in that. The first recipe is the default;
+each further one leaves the fewest windows more than 1e-4 above the best end of all, and among
+equals has the lowest mean of log10(end / best - 1 + 1e-6)."""
 
 from __future__ import annotations
 
@@ -36,7 +37,10 @@ class Recipe(NamedTuple):
 
 
 CANDIDATES = (
-    *(Recipe(policy) for policy in ("guarded", "bold", "ceres", "ceres+embedded", "nielsen+embedded")),
+    *(
+        Recipe(policy)
+        for policy in ("guarded", "bold", "ceres", "ceres+embedded", "nielsen+embedded")
+    ),
     *(Recipe(policy, lenses_first=True) for policy in ("guarded", "bold", "ceres")),
 )
 """The first one is the default."""
@@ -57,17 +61,25 @@ def ends(problems: list[BundleProblem], recipe: Recipe) -> np.ndarray:
             for one, end in zip(problems, held, strict=True)
         ]
     found = jaxba.solve_many(starts, recipe.policy)
-    return np.array([one.final_cost if isinstance(one, jaxba.Solution) else np.inf for one in found])
+    return np.array(
+        [one.final_cost if isinstance(one, jaxba.Solution) else np.inf for one in found]
+    )
 
 
 def table(draws: list[int]) -> np.ndarray:
     """Distances above the best end, of windows by recipes."""
-    problems = [one.problem for draw in draws for one in cases(draw) if one.group.startswith("window")]
+    problems = [
+        one.problem for draw in draws for one in cases(draw) if one.group.startswith("window")
+    ]
     columns = []
     for recipe in CANDIDATES:
         began = time.perf_counter()
         columns.append(ends(problems, recipe))
-        print(f"{len(problems)} windows, {recipe}: {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
+        print(
+            f"{len(problems)} windows, {recipe}: {time.perf_counter() - began:.0f} s",
+            file=sys.stderr,
+            flush=True,
+        )
     every = np.stack(columns, axis=1)
     return every / every.min(axis=1, keepdims=True) - 1
 
@@ -87,7 +99,9 @@ def order(above: np.ndarray) -> list[int]:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--choose", type=int, nargs="*", default=[0, 1])
     parser.add_argument("--judge", type=int, nargs="*", default=[2, 3])
     parser.add_argument("--out")
@@ -100,13 +114,18 @@ def main() -> None:
     chosen = order(seen)
     heading = " ".join(f"> {one:g}" for one in ABOVE)
     print(
-        f"first K recipes: windows of the choice that end above the best by {heading} | judged windows | alone, judged"
+        f"first K recipes: windows of the choice that end above the best by {heading} | judged "
+        "windows | alone, judged"
     )
     print(f"now: {', '.join(RECIPES)}")
     for count, last in enumerate(chosen, 1):
         shares = [
             "  ".join(f"{np.mean(rows > one):4.0%}" for one in ABOVE)
-            for rows in (seen[:, chosen[:count]].min(axis=1), judged[:, chosen[:count]].min(axis=1), judged[:, last])
+            for rows in (
+                seen[:, chosen[:count]].min(axis=1),
+                judged[:, chosen[:count]].min(axis=1),
+                judged[:, last],
+            )
         ]
         print(f"{count:2d} + {CANDIDATES[last]!s:40s} {' | '.join(shares)}")
 

@@ -2,11 +2,11 @@
 
     python -m benchmarks.sac [--repeats 5] [--envs 64] [--out FILE]
 
-The task is Pendulum with two hidden layers, batches of 256, and one update per vector step. The width is 256, as in
-sbx, and 64, as in jaxba's preset. sbx (the package `sbx-rl`) runs with the Python interpreter that `JAXBA_SBX` names;
-without it, sbx is left out with a message. Compilation and warm-up are not counted. The two are timed alternately, and
-the least time of each is used, since other work on the machine can only add to it.
-"""
+The task is Pendulum with two hidden layers, batches of 256, and one update per vector step. The
+width is 256, as in sbx, and 64, as in jaxba's preset. sbx (the package `sbx-rl`) runs with the
+Python interpreter that `JAXBA_SBX` names; without it, sbx is left out with a message. Compilation
+and warm-up are not counted. The two are timed alternately, and the least time of each is used,
+since other work on the machine can only add to it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ class _Swing(NamedTuple):
 @register_pytree
 @dataclass(frozen=True)
 class Pendulum:
-    """Gymnasium's Pendulum-v1: mass 1 kg, length 1 m, gravity 10 m/s^2, torque at most 2 Nm, steps of 0.05 s."""
+    """Gymnasium's Pendulum-v1: mass 1 kg, length 1 m, gravity 10 m/s^2, torque at most 2 Nm, steps
+    of 0.05 s."""
 
     num_envs: int = dataclasses.field(metadata={"static": True})
     """Number of pendulums."""
@@ -90,7 +91,9 @@ class Pendulum:
         angle, speed, clock = map(choose, fresh[:3], moved[:3])
         after = _Swing(angle, speed, clock, fresh.key)
         metrics = {"length": moved.clock.astype(jnp.float32)}
-        return after, Step(self._see(after), reward, jnp.zeros_like(ended), ended, self._see(moved), metrics)
+        return after, Step(
+            self._see(after), reward, jnp.zeros_like(ended), ended, self._see(moved), metrics
+        )
 
     def demonstrate(self, state: Any, key: Array) -> Array:
         """See `Environment`."""
@@ -105,8 +108,9 @@ import json, sys, time
 import jax
 from sbx import SAC
 updates, together = int(sys.argv[1]), int(sys.argv[2])
-model = SAC("MlpPolicy", "Pendulum-v1", batch_size=256, buffer_size=100_000, learning_starts=256, seed=0,
-            train_freq=together, gradient_steps=together, policy_kwargs={"net_arch": [256, 256]})
+model = SAC("MlpPolicy", "Pendulum-v1", batch_size=256, buffer_size=100_000,
+            learning_starts=256, seed=0, train_freq=together,
+            gradient_steps=together, policy_kwargs={"net_arch": [256, 256]})
 model.learn(512 + 2 * together)
 print("READY", flush=True)
 for _ in sys.stdin:
@@ -116,7 +120,8 @@ for _ in sys.stdin:
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     print(json.dumps([model._n_updates - before, wall, cpu]), flush=True)
 """
-"""Program for the interpreter `JAXBA_SBX`: makes a measurement for each line on its standard input."""
+"""Program for the interpreter `JAXBA_SBX`: makes a measurement for each line on its standard
+input."""
 
 
 class Sample(NamedTuple):
@@ -128,7 +133,8 @@ class Sample(NamedTuple):
 
 
 def ours(config: SacConfig, envs: int, updates: int) -> Callable[[], Sample]:
-    """A function that measures jaxba's loop with one update per vector step, after compilation and warm-up."""
+    """A function that measures jaxba's loop with one update per vector step, after compilation and
+    warm-up."""
     env, loop = jax.device_put(Pendulum(envs)), LoopConfig(100_000, 1000, 1, updates)
     state, _ = run_chunk(config, loop, env, start(config, loop, env, jax.random.key(0)))
     held = [jax.block_until_ready(state)]
@@ -226,7 +232,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Gradient updates per second, compared with sbx.")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--envs", type=int, default=64, help="number of pendulums")
-    parser.add_argument("--updates", type=int, default=512, help="number of gradient updates in a measurement")
+    parser.add_argument(
+        "--updates", type=int, default=512, help="number of gradient updates in a measurement"
+    )
     parser.add_argument("--out", default="", help="output file of the metrics as JSON")
     args = parser.parse_args()
     metrics = run(args.repeats, args.envs, args.updates)

@@ -1,9 +1,10 @@
-"""What there is to carry (lines, classes, rooms, branches, words), and how far a value walks through the code.
+"""What there is to carry (lines, classes, rooms, branches, words), and how far a value walks
+through the code.
 
     python -m benchmarks.size [FOLDER]
 
-FOLDER holds the checkout to measure, the current one by default. Walks are those of the package that Python imports.
-"""
+FOLDER holds the checkout to measure, the current one by default. Walks are those of the package
+that Python imports."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ import jax.numpy as jnp
 import jaxba
 
 LABORATORY = ("methods", "kitti", "datasets/kitti", "game", "training", "peers", "bench", "paper")
-"""Rooms that ask rather than solve, as in tests/test_imports.py; earlier versions had KITTI among the data sets."""
+"""Rooms that ask rather than solve, as in tests/test_imports.py; earlier versions had KITTI among
+the data sets."""
 
 LABORATORY_COMMANDS = ("bench", "train", "kitti", "paper")
 """Modules of commands that belong to them."""
@@ -43,7 +45,10 @@ def sources(root: Path) -> dict[str, str]:
 def in_laboratory(path: str) -> bool:
     """Whether a file belongs to the laboratory."""
     commands = {f"cli/{name}" for name in LABORATORY_COMMANDS}
-    return path.startswith(tuple(f"{room}/" for room in LABORATORY)) or path.removesuffix(".py") in commands
+    return (
+        path.startswith(tuple(f"{room}/" for room in LABORATORY))
+        or path.removesuffix(".py") in commands
+    )
 
 
 def room(path: str) -> str:
@@ -71,17 +76,25 @@ def floors(graph: dict[str, set[str]]) -> int:
 
 
 def inner_imports(root: Path) -> int:
-    """Names that tests import and that neither `jaxba` offers nor a page of the documents describes."""
+    """Names that tests import and that neither `jaxba` offers nor a page of the documents
+    describes."""
     described = {
-        name for path in (root / "docs").rglob("*.md") for name in re.findall(r"^::: (\S+)", path.read_text(), re.M)
+        name
+        for path in (root / "docs").rglob("*.md")
+        for name in re.findall(r"^::: (\S+)", path.read_text(), re.M)
     }
     public = described | {f"jaxba.{name}" for name in jaxba.__all__}
     found = 0
     for path in (root / "tests").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "jaxba":
+            if (
+                isinstance(node, ast.ImportFrom)
+                and (node.module or "").partition(".")[0] == "jaxba"
+            ):
                 names = [name.name for name in node.names]
-                found += sum(not public & {f"{node.module}.{name}", f"jaxba.{name}"} for name in names)
+                found += sum(
+                    not public & {f"{node.module}.{name}", f"jaxba.{name}"} for name in names
+                )
     return found
 
 
@@ -94,15 +107,23 @@ def counts(root: Path) -> dict[str, int]:
     documents = [root / "README.md", *(root / "docs").rglob("*.md")]
     return {
         "lines": sum(lines.values()),
-        "lines of the library": sum(count for path, count in lines.items() if not in_laboratory(path)),
-        "lines of the laboratory": sum(count for path, count in lines.items() if in_laboratory(path)),
+        "lines of the library": sum(
+            count for path, count in lines.items() if not in_laboratory(path)
+        ),
+        "lines of the laboratory": sum(
+            count for path, count in lines.items() if in_laboratory(path)
+        ),
         "files": len(texts),
-        "classes": sum(len(re.findall(r"^\s*class \w", text, re.MULTILINE)) for text in python.values()),
+        "classes": sum(
+            len(re.findall(r"^\s*class \w", text, re.MULTILINE)) for text in python.values()
+        ),
         "rooms": len(graph),
         "floors": floors(graph),
         "arrows between rooms": sum(map(len, graph.values())),
         "branches on None in the core": sum(
-            len(re.findall(r"is None|is not None|in_rigs", text)) for path, text in python.items() if room(path) in CORE
+            len(re.findall(r"is None|is not None|in_rigs", text))
+            for path, text in python.items()
+            if room(path) in CORE
         ),
         "words of documents": sum(len(path.read_text().split()) for path in documents),
         "inner imports in tests": inner_imports(root),
@@ -127,11 +148,14 @@ class Walk:
         code = frame.f_code
         names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
         stay = (module, code.co_qualname)
-        if self.stays[-1:] != [stay] and any(self.takes(name, frame.f_locals.get(name)) for name in names):
+        if self.stays[-1:] != [stay] and any(
+            self.takes(name, frame.f_locals.get(name)) for name in names
+        ):
             self.stays.append(stay)
 
     def follow(self, work: Callable[[], object]) -> str:
-        """Stays, moves between rooms, and moves into a room that imports the one before, while `work` runs."""
+        """Stays, moves between rooms, and moves into a room that imports the one before, while
+        `work` runs."""
         sys.setprofile(self)
         try:
             work()
@@ -152,12 +176,16 @@ def walks() -> dict[str, str]:
 
     def trace_step() -> None:
         jax.clear_caches()  # else the second trace would be the first
-        jax.eval_shape(partial(jaxba.lm_step, ready.layout, options=ready.options), ready.state, jnp.asarray(1e-4))
+        jax.eval_shape(
+            partial(jaxba.lm_step, ready.layout, options=ready.options),
+            ready.state,
+            jnp.asarray(1e-4),
+        )
 
     return {
-        "`problem` through `solve`": Walk(lambda name, value: isinstance(value, jaxba.BundleProblem)).follow(
-            lambda: jaxba.solve(problem, options=options)
-        ),
+        "`problem` through `solve`": Walk(
+            lambda name, value: isinstance(value, jaxba.BundleProblem)
+        ).follow(lambda: jaxba.solve(problem, options=options)),
         "damping through `lm_step`": Walk(lambda name, value: name == "damping").follow(trace_step),
         "`layout` through `lm_step`": Walk(lambda name, value: name == "layout").follow(trace_step),
     }

@@ -2,14 +2,14 @@
 
     python -m benchmarks.start [PROBLEM ...] [--repeats 5] [--python PATH] [--out FILE]
 
-PROBLEM is a file or a folder of a COLMAP model below `JAXBA_DATA`. Calls are timed with an empty cache of compiled
-programs (cold), again with what the first has stored and another process has compiled after it (warm), and then on
-another problem of about the same size: the same one without 3% of its points, or for the long sequence of KITTI another
-window of 40 cameras. Reading and writing count. Beside them stand pycolmap's bundle adjustment of a COLMAP model, which
-reads and writes it too, and C++ Ceres on a BAL file (`JAXBA_CERES`) in the faster of its direct modes. `empty` is a
-process that runs an empty program of JAX. `--python` repeats all of it with a second interpreter, for another version
-of JAX. Seconds are medians.
-"""
+PROBLEM is a file or a folder of a COLMAP model below `JAXBA_DATA`. Calls are timed with an empty
+cache of compiled programs (cold), again with what the first has stored and another process has
+compiled after it (warm), and then on another problem of about the same size: the same one without
+3% of its points, or for the long sequence of KITTI another window of 40 cameras. Reading and
+writing count. Beside them stand pycolmap's bundle adjustment of a COLMAP model, which reads and
+writes it too, and C++ Ceres on a BAL file (`JAXBA_CERES`) in the faster of its direct modes.
+`empty` is a process that runs an empty program of JAX. `--python` repeats all of it with a second
+interpreter, for another version of JAX. Seconds are medians."""
 
 from __future__ import annotations
 
@@ -52,10 +52,12 @@ PROBLEMS = (
     "bal-converted/kitti00vo-250-24288-pre.txt.bz2",
     "bal-converted/kittistereo00s-77-15638-pre.txt.bz2",
 )
-"""Problems of 1,400 to 60,000 observations; of the sequence of 250 cameras only windows are solved."""
+"""Problems of 1,400 to 60,000 observations; of the sequence of 250 cameras only windows are
+solved."""
 
 WINDOW, LONGEST = 40, 100
-"""Cameras of a window, and the number of cameras from which on a problem is a sequence of which windows are solved."""
+"""Cameras of a window, and the number of cameras from which on a problem is a sequence of which
+windows are solved."""
 
 LEFT_OUT = 0.03
 """Share of the points that the other problem lacks."""
@@ -85,21 +87,28 @@ def fewer_points(problem: BundleProblem) -> BundleProblem:
 
 
 def two_problems(source: Path, folder: Path) -> tuple[Path, Path]:
-    """Writes a problem and another one of about its size, or only the other, into a folder; the paths of both."""
+    """Writes a problem and another one of about its size, or only the other, into a folder; the
+    paths of both."""
     other = folder / "other.txt"
     if source.is_dir():
         import pycolmap
 
         model: Any = pycolmap.Reconstruction(str(source))
         points = sorted(model.points3D)
-        for point in np.random.default_rng(0).choice(points, int(LEFT_OUT * len(points)), replace=False):
+        for point in np.random.default_rng(0).choice(
+            points, int(LEFT_OUT * len(points)), replace=False
+        ):
             model.delete_point3D(int(point))
         other = folder / "other"
         other.mkdir()
         model.write(str(other))
         return source, other
     problem, first = read_problem(source), folder / "first.txt"
-    pair = (problem, fewer_points(problem)) if problem.num_cameras < LONGEST else windows(problem, 2, WINDOW)
+    pair = (
+        (problem, fewer_points(problem))
+        if problem.num_cameras < LONGEST
+        else windows(problem, 2, WINDOW)
+    )
     for each, path in zip(pair, (first, other), strict=True):
         write_bal(each, path)
     return first, other
@@ -107,8 +116,13 @@ def two_problems(source: Path, folder: Path) -> tuple[Path, Path]:
 
 def seconds(python: str, code: str, *arguments: Path, cache: str = "off") -> float:
     """Wall time of a process."""
-    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-    environment |= {CACHE_VARIABLE: cache, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"
+    }
+    environment |= {
+        CACHE_VARIABLE: cache,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
     started = time.perf_counter()
     command = [python, "-c", code, *map(str, arguments)]
     done = subprocess.run(command, env=environment, cwd="/", capture_output=True, text=True)
@@ -152,7 +166,8 @@ def calls(python: str, first: Path, other: Path, folder: Path) -> dict[str, floa
 
 
 def metrics_of(python: str, sources: list[Path], repeats: int) -> Iterator[Metric]:
-    """Medians of all calls with an interpreter, with their targets, and of the empty program last."""
+    """Medians of all calls with an interpreter, with their targets, and of the empty program
+    last."""
     measured: dict[str, list[dict[str, float]]] = {}
     for source in sources:
         with tempfile.TemporaryDirectory() as name:
@@ -160,15 +175,21 @@ def metrics_of(python: str, sources: list[Path], repeats: int) -> Iterator[Metri
             label = f"{source.name.split('-pre')[0]} ({read_problem(first).num_observations} obs)"
             for _ in range(repeats):
                 measured.setdefault(label, []).append(calls(python, first, other, Path(name)))
-                line = ", ".join(f"{kind} {value:.2f}" for kind, value in measured[label][-1].items())
+                line = ", ".join(
+                    f"{kind} {value:.2f}" for kind, value in measured[label][-1].items()
+                )
                 print(f"{label}: {line}", file=sys.stderr, flush=True)
     empty = statistics.median(run["empty"] for runs in measured.values() for run in runs)
-    targets = {kind: max(least, times * empty) for kind, (least, times) in (("cold", COLD), ("warm", WARM))}
+    targets = {
+        kind: max(least, times * empty) for kind, (least, times) in (("cold", COLD), ("warm", WARM))
+    }
     for label, runs in measured.items():
         for kind in runs[0]:
             if kind != "empty":
                 value = statistics.median(run[kind] for run in runs)
-                yield Metric(f"{python}/{label}/{kind}", value, "s", "lower", target=targets.get(kind))
+                yield Metric(
+                    f"{python}/{label}/{kind}", value, "s", "lower", target=targets.get(kind)
+                )
     yield Metric(f"{python}/empty", empty, "s", "lower")
 
 
@@ -181,11 +202,17 @@ def to_markdown(metrics: list[Metric]) -> str:
         mark = {None: "", True: " met", False: " missed"}[metric.met]
         rows.setdefault(label, {})[kind] = f"{metric.value:.2f}{mark}"
     lines = [f"| problem | {' | '.join(kinds)} |", "| --- |" + " ---: |" * len(kinds)]
-    lines += [f"| {label} | {' | '.join(row.get(kind, '') for kind in kinds)} |" for label, row in rows.items()]
-    targets = [
-        f"{kind} at most {next(m.target for m in metrics if m.key.endswith('/' + kind)):.2f}" for kind in kinds[:2]
+    lines += [
+        f"| {label} | {' | '.join(row.get(kind, '') for kind in kinds)} |"
+        for label, row in rows.items()
     ]
-    return "\n".join([*lines, "", f"Empty program {metrics[-1].value:.2f} s. Targets, s: {', '.join(targets)}."])
+    targets = [
+        f"{kind} at most {next(m.target for m in metrics if m.key.endswith('/' + kind)):.2f}"
+        for kind in kinds[:2]
+    ]
+    return "\n".join(
+        [*lines, "", f"Empty program {metrics[-1].value:.2f} s. Targets, s: {', '.join(targets)}."]
+    )
 
 
 def main() -> None:
@@ -202,9 +229,16 @@ def main() -> None:
             parser.error(f"{name} is not below JAXBA_DATA")
     other = os.path.abspath(args.python) if args.python else None  # calls run in the root folder
     for python in filter(None, (sys.executable, other)):
-        found = list(metrics_of(python, [data / name for name in args.problem or PROBLEMS], args.repeats))
+        found = list(
+            metrics_of(python, [data / name for name in args.problem or PROBLEMS], args.repeats)
+        )
         versions = subprocess.run(
-            [python, "-c", "import jax, platform; print('Python', platform.python_version(), 'JAX', jax.__version__)"],
+            [
+                python,
+                "-c",
+                "import jax, platform; print('Python', platform.python_version(), 'JAX', "
+                "jax.__version__)",
+            ],
             capture_output=True,
             text=True,
         )

@@ -1,12 +1,12 @@
 """Speed of jaxba compared with Ceres, in one run.
 
-    python -m benchmarks.suite [--only iteration,scenes,cold,tolerance,large,layout] [--solvers ...] [--repeats 3]
+    python -m benchmarks.suite [--only iteration,scenes,cold,tolerance,large,layout] [--solvers ...]
+    [--repeats 3]
         [--gate] [--update-baseline]
 
-`JAXBA_DATA` names the folder of real problems, and `JAXBA_CERES` the program with C++ Ceres (benchmarks/README.md).
-Parts whose data or program are missing are left out with a message. `--gate` compares ratios with
-benchmarks/baseline.json.
-"""
+`JAXBA_DATA` names the folder of real problems, and `JAXBA_CERES` the program with C++ Ceres
+(benchmarks/README.md). Parts whose data or program are missing are left out with a message.
+`--gate` compares ratios with benchmarks/baseline.json."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 BASELINE = HERE / "baseline.json"
 GATE_TOLERANCE = 0.25
-"""Relative change of a ratio that `--gate` accepts: ratios of short runs on a shared machine vary by up to 15%."""
+"""Relative change of a ratio that `--gate` accepts: ratios of short runs on a shared machine vary
+by up to 15%."""
 
 ITERATION_PROBLEMS = (
     "bal/problem-49-7776-pre.txt.bz2",
@@ -55,22 +56,26 @@ TOLERANCE_SOLVERS = (
     "nielsen+refine3@float32",
     "bold@float32",
 )
-"""Rules with embedded iterations, and `bold`; some also in float32, which is accurate enough for 1e-3."""
+"""Rules with embedded iterations, and `bold`; some also in float32, which is accurate enough for
+1e-3."""
 
 ROUNDING = 2e-5
-"""Relative error of a cost in float32, by which a solve may end above its target: a fiftieth of the tolerance."""
+"""Relative error of a cost in float32, by which a solve may end above its target: a fiftieth of the
+tolerance."""
 
 MIN_SOLVES = 5
 """Smallest number of timed solves to a tolerance."""
 
 LARGE_SCENES = ("scene:random-150", "scene:ladybug-1197")
-"""Random scenes larger than the real problems; the second has the size of the BAL problem Ladybug-1197."""
+"""Random scenes larger than the real problems; the second has the size of the BAL problem
+Ladybug-1197."""
 
 SMALL_SCENES = ("scene:tiny", "scene:paper")
 """Scenes so small that the fixed cost of a layout matters."""
 
 LARGE_ITERATIONS = 30
-"""Limit of Ceres' iterations on the large scenes. jaxba's step under Ceres' rule takes 17 to f*(1 + 1e-3)."""
+"""Limit of Ceres' iterations on the large scenes. jaxba's step under Ceres' rule takes 17 to f*(1 +
+1e-3)."""
 
 MAX_DENSE_CAMERAS = 500
 """With more cameras, Ceres' dense mode takes minutes per iteration and is left out."""
@@ -96,7 +101,8 @@ def real_problems() -> list[str]:
 
 
 def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
-    """Seconds per LM iteration, of jaxba's linear solver `auto` and of Ceres' modes, and the ratio to the best mode."""
+    """Seconds per LM iteration, of jaxba's linear solver `auto` and of Ceres' modes, and the ratio
+    to the best mode."""
     from jaxba.bench.sources import sources
     from jaxba.io import write_problem
 
@@ -112,7 +118,9 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
         label = f"iteration/{source.name}"
         yield Metric(f"{label}/jaxba ({linear_solver})", ours, "s", "lower")
         ratio = _layout_seconds(problem, repeats) / ours
-        yield Metric(f"{label}/layout over an iteration", ratio, "ratio", "lower", GATE_TOLERANCE, target=1.0)
+        yield Metric(
+            f"{label}/layout over an iteration", ratio, "ratio", "lower", GATE_TOLERANCE, target=1.0
+        )
         if binary is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
@@ -125,24 +133,35 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
                 theirs[mode] = statistics.median(run.seconds_per_iteration for run in runs)
                 yield Metric(f"{label}/ceres {mode}", theirs[mode], "s", "lower")
         best = min(theirs.values())
-        yield Metric(f"{label}/jaxba over ceres", ours / best, "ratio", "lower", GATE_TOLERANCE, target=0.5)
+        yield Metric(
+            f"{label}/jaxba over ceres", ours / best, "ratio", "lower", GATE_TOLERANCE, target=0.5
+        )
 
 
 def layout_times(repeats: int) -> Iterator[Metric]:
-    """Time of the layout relative to an iteration, on every real problem and on the smallest random scenes."""
+    """Time of the layout relative to an iteration, on every real problem and on the smallest random
+    scenes."""
     from jaxba.bench.sources import sources
 
     for source in sources([*real_problems(), *SMALL_SCENES]):
         problem = source.read()
         ratio = _layout_seconds(problem, repeats) / iteration_seconds(problem, repeats)[0]
-        yield Metric(f"layout/{source.name}, over an iteration", ratio, "ratio", "lower", GATE_TOLERANCE, 1.0)
+        yield Metric(
+            f"layout/{source.name}, over an iteration", ratio, "ratio", "lower", GATE_TOLERANCE, 1.0
+        )
 
 
 def _modes(problem: BundleProblem) -> list[str]:
-    return [mode for mode in peers.MODES if mode != "DENSE_SCHUR" or problem.num_cameras <= MAX_DENSE_CAMERAS]
+    return [
+        mode
+        for mode in peers.MODES
+        if mode != "DENSE_SCHUR" or problem.num_cameras <= MAX_DENSE_CAMERAS
+    ]
 
 
-def iteration_seconds(problem: BundleProblem, repeats: int, method: str = "lm") -> tuple[float, str]:
+def iteration_seconds(
+    problem: BundleProblem, repeats: int, method: str = "lm"
+) -> tuple[float, str]:
     """Median seconds of an iteration under Ceres' rule without compilation, and the linear solver.
 
     Args:
@@ -186,8 +205,8 @@ def time_to_tolerance(
 ) -> Iterator[Metric]:
     """Time to the cost f*(1 + 1e-3), of jaxba's solvers and of Ceres.
 
-    f* is the lowest cost of all runs on the problem. jaxba is timed as one compiled program that ends at that cost.
-    Ceres is timed under its own rule, with its own clock, in its fastest mode.
+    f* is the lowest cost of all runs on the problem. jaxba is timed as one compiled program that
+    ends at that cost. Ceres is timed under its own rule, with its own clock, in its fastest mode.
 
     Args:
         part: name of this part of the suite, for the metrics.
@@ -202,7 +221,9 @@ def time_to_tolerance(
 
     binary = peers.program()
     if binary is None or not problems:
-        print(f"left out: {part} (needs JAXBA_CERES; for real problems JAXBA_DATA)", file=sys.stderr)
+        print(
+            f"left out: {part} (needs JAXBA_CERES; for real problems JAXBA_DATA)", file=sys.stderr
+        )
         return
     ratios: dict[str, list[float]] = {name: [] for name in solvers}
     for source in sources(problems):
@@ -211,24 +232,41 @@ def time_to_tolerance(
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "problem.txt"
             write_problem(problem, file)
-            runs = [[peers.run(binary, file, m, threads, limit) for _ in range(repeats)] for m in _modes(problem)]
+            runs = [
+                [peers.run(binary, file, m, threads, limit) for _ in range(repeats)]
+                for m in _modes(problem)
+            ]
         best = min(final_costs + [run.final_cost for mode in runs for run in mode])
         target = best * (1 + 1e-3)
         theirs = min(statistics.median(run.seconds_to(target) for run in mode) for mode in runs)
         yield Metric(f"{part}/{source.name}/ceres best mode", theirs, "s", "lower")
         for name, cost in zip(solvers, final_costs, strict=True):
-            ours = _seconds_to(problem, name, target, max(repeats, MIN_SOLVES)) if cost <= target else math.inf
+            ours = (
+                _seconds_to(problem, name, target, max(repeats, MIN_SOLVES))
+                if cost <= target
+                else math.inf
+            )
             yield Metric(f"{part}/{source.name}/jaxba {name}", ours, "s", "lower")
             if math.isfinite(ours) and math.isfinite(theirs):
                 ratios[name].append(ours / max(theirs, 1e-6))
     for name, both in ratios.items():
         mean = math.exp(statistics.fmean(map(math.log, both))) if both else math.inf
-        yield Metric(f"{part}/geometric mean, {name} over ceres", mean, "ratio", "lower", GATE_TOLERANCE, target=0.25)
+        yield Metric(
+            f"{part}/geometric mean, {name} over ceres",
+            mean,
+            "ratio",
+            "lower",
+            GATE_TOLERANCE,
+            target=0.25,
+        )
         yield Metric(f"{part}/problems that {name} and ceres reached", len(both), "count", "higher")
 
 
-def _cost_and_seconds(problem: BundleProblem, name: str, target: float = 0.0) -> tuple[float, float]:
-    """Final cost, evaluated in float64, and seconds of a solve in one program that ends at the target cost."""
+def _cost_and_seconds(
+    problem: BundleProblem, name: str, target: float = 0.0
+) -> tuple[float, float]:
+    """Final cost, evaluated in float64, and seconds of a solve in one program that ends at the
+    target cost."""
     import jaxba
     from jaxba.problem import geometry
     from jaxba.solver.names import parse_solver
@@ -238,7 +276,9 @@ def _cost_and_seconds(problem: BundleProblem, name: str, target: float = 0.0) ->
     solution = jaxba.solve(
         problem,
         policy,
-        dataclasses.replace(options, tolerances=jaxba.Tolerances(target=target), compilation="full"),
+        dataclasses.replace(
+            options, tolerances=jaxba.Tolerances(target=target), compilation="full"
+        ),
     )
     return geometry.cost(solution.problem), solution.total_s
 
@@ -253,8 +293,9 @@ def _seconds_to(problem: BundleProblem, name: str, target: float, repeats: int) 
 
 
 def scene_throughput(repeats: int, scenes: int = 256) -> Iterator[Metric]:
-    """LM steps per second on scenes of 10 cameras and 10 points, all in one vmapped program: with free lenses, and as
-    the game of the paper has them, with dense algebra and with conjugate gradients."""
+    """LM steps per second on scenes of 10 cameras and 10 points, all in one vmapped program: with
+    free lenses, and as the game of the paper has them, with dense algebra and with conjugate
+    gradients."""
     import jax
     import jax.numpy as jnp
 
@@ -269,8 +310,17 @@ def scene_throughput(repeats: int, scenes: int = 256) -> Iterator[Metric]:
         layouts = [jaxba.build_layout(problem) for problem in problems]
         layout, damping = stack(layouts), jnp.full(scenes, 1e-3)
         runs = {}
-        for name, options in {"": jaxba.StepOptions(), ", the game's, dense": dense, ", the game's, cg": game}.items():
-            states = stack([jaxba.initial_state(one, p, options) for one, p in zip(layouts, problems, strict=True)])
+        for name, options in {
+            "": jaxba.StepOptions(),
+            ", the game's, dense": dense,
+            ", the game's, cg": game,
+        }.items():
+            states = stack(
+                [
+                    jaxba.initial_state(one, p, options)
+                    for one, p in zip(layouts, problems, strict=True)
+                ]
+            )
             step = jax.jit(jax.vmap(functools.partial(jaxba.lm_step, options=options)))
             runs[name] = functools.partial(step, layout, states, damping)
         times: dict[str, list[float]] = {name: [] for name in runs}
@@ -285,8 +335,8 @@ def scene_throughput(repeats: int, scenes: int = 256) -> Iterator[Metric]:
 
 
 def cold_start() -> Iterator[Metric]:
-    """Wall time of a call of `jaxba-solve`: with an empty compilation cache, with a filled one, and with
-    `--compilation full`."""
+    """Wall time of a call of `jaxba-solve`: with an empty compilation cache, with a filled one, and
+    with `--compilation full`."""
     location = locate(COLD_PROBLEM)
     if location is None:
         print("left out: cold start (JAXBA_DATA)", file=sys.stderr)
@@ -294,15 +344,32 @@ def cold_start() -> Iterator[Metric]:
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "JAXBA_CACHE": folder}
         command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", location]
-        runs = (("cold", 8.0, []), ("warm", 3.0, []), ("cold, full", None, ["--compilation", "full"]))
+        runs = (
+            ("cold", 8.0, []),
+            ("warm", 3.0, []),
+            ("cold, full", None, ["--compilation", "full"]),
+        )
         measured = {}
         for name, target, more in runs:
             started = time.perf_counter()
             subprocess.run([*command, *more], env=environment, check=True, capture_output=True)
             measured[name] = time.perf_counter() - started
-            yield Metric(f"start/jaxba-solve on ladybug-49, {name}", measured[name], "s", "lower", target=target)
+            yield Metric(
+                f"start/jaxba-solve on ladybug-49, {name}",
+                measured[name],
+                "s",
+                "lower",
+                target=target,
+            )
         ratio = measured["cold"] / measured["cold, full"]
-        yield Metric("start/cold over cold with full compilation", ratio, "ratio", "lower", GATE_TOLERANCE, target=1.0)
+        yield Metric(
+            "start/cold over cold with full compilation",
+            ratio,
+            "ratio",
+            "lower",
+            GATE_TOLERANCE,
+            target=1.0,
+        )
 
 
 def main() -> int:
@@ -313,9 +380,15 @@ def main() -> int:
         default="iteration,scenes,cold,tolerance,large",
         help="comma-separated parts; also: layout, on all problems",
     )
-    parser.add_argument("--solvers", default=",".join(TOLERANCE_SOLVERS), help="solvers of the parts tolerance, large")
+    parser.add_argument(
+        "--solvers",
+        default=",".join(TOLERANCE_SOLVERS),
+        help="solvers of the parts tolerance, large",
+    )
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--gate", action="store_true", help="fail if a ratio is worse than the baseline")
+    parser.add_argument(
+        "--gate", action="store_true", help="fail if a ratio is worse than the baseline"
+    )
     parser.add_argument("--update-baseline", action="store_true")
     parser.add_argument("--out", default="", help="output file of the metrics as JSON")
     args = parser.parse_args()
@@ -330,8 +403,12 @@ def main() -> int:
         "layout": lambda: layout_times(args.repeats),
         "scenes": lambda: scene_throughput(args.repeats),
         "cold": cold_start,
-        "tolerance": lambda: time_to_tolerance("tolerance", real_problems(), solvers, 100, args.repeats, threads()),
-        "large": lambda: time_to_tolerance("large", list(LARGE_SCENES), solvers, LARGE_ITERATIONS, 1, threads()),
+        "tolerance": lambda: time_to_tolerance(
+            "tolerance", real_problems(), solvers, 100, args.repeats, threads()
+        ),
+        "large": lambda: time_to_tolerance(
+            "large", list(LARGE_SCENES), solvers, LARGE_ITERATIONS, 1, threads()
+        ),
     }
     metrics = []
     for name in args.only.split(","):

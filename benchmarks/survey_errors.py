@@ -1,11 +1,14 @@
-"""Random surveys with one gross error each: is it said, and by its name? And clean ones, of which nothing should be.
+"""Random surveys with one gross error each: is it said, and by its name? And clean ones, of which
+nothing should be.
 
-    python -m benchmarks.survey_errors [--surveys 100] [--clean 100] [--kinds typo,click] [--seed 0] [--command 10]
+    python -m benchmarks.survey_errors [--surveys 100] [--clean 100] [--kinds typo,click] [--seed 0]
+    [--command 10]
 
-Each survey is written as files (`benchmarks/survey_scenes.py`), read by `jaxba.survey` and solved by `jaxba.solve`;
-every tenth goes through `jaxba-solve`. An error is found if there is an error, a note or one of `Solution.notes`, and
-named if that has the name of the row which is wrong, or of a whole table its key, or what its columns are. A table of
-other units or with its columns swapped may be read as meant, too, so that cameras are where they are without it."""
+Each survey is written as files (`benchmarks/survey_scenes.py`), read by `jaxba.survey` and solved
+by `jaxba.solve`; every tenth goes through `jaxba-solve`. An error is found if there is an error, a
+note or one of `Solution.notes`, and named if that has the name of the row which is wrong, or of a
+whole table its key, or what its columns are. A table of other units or with its columns swapped may
+be read as meant, too, so that cameras are where they are without it."""
 
 from __future__ import annotations
 
@@ -25,7 +28,16 @@ import jax
 import numpy as np
 
 import jaxba
-from benchmarks.survey_scenes import CHECKS, CONTROLS, SHAPES, Survey, depth_maps, draw, on_earth, write
+from benchmarks.survey_scenes import (
+    CHECKS,
+    CONTROLS,
+    SHAPES,
+    Survey,
+    depth_maps,
+    draw,
+    on_earth,
+    write,
+)
 from jaxba.problem import geometry
 
 Rng = np.random.Generator
@@ -49,7 +61,9 @@ class Outcome:
     """What was said of a survey."""
 
     notes: tuple[str, ...]
-    away: float  # RMS distance of camera centres from the truth, metres; NaN where it was refused or not georeferenced
+    # RMS distance of camera centres from the truth, metres; NaN where it was refused or not
+    # georeferenced
+    away: float
     limit: float  # what it may be without an error
 
     mended: bool = False  # whether the survey was read as meant
@@ -156,7 +170,8 @@ def units(survey: Survey, rng: Rng) -> Words:
     survey.marks = survey.marks[kept]
     survey.mark_seen = survey.mark_seen[kept]
     survey.mark_pixels = survey.mark_pixels[kept]
-    level = survey.shape != "facade"  # mirrored along their normal, three points are in the same plane
+    # mirrored along their normal, three points are in the same plane
+    level = survey.shape != "facade"
     survey.marks = survey.marks[:, [1, 0, 2]] if level else survey.marks * [1, 1, -1]
     return (*AXES, *MARKS, "upside")
 
@@ -170,10 +185,14 @@ KINDS: dict[str, tuple[Callable[[Survey, Rng], Words], Words]] = {
     "heights": (heights, ("block log", "block marks", "block log marks", "strip log marks")),
     "no-fix": (no_fix, ("block log", "block log marks", "room log depths")),
     "disparity": (disparity, ("room log depths",)),
-    "outside": (outside, ("block marks", "strip log marks", "facade marks", "room log depths", "room log depths")),
+    "outside": (
+        outside,
+        ("block marks", "strip log marks", "facade marks", "room log depths", "room log depths"),
+    ),
     "units": (units, ("block log marks", "block marks", "facade marks")),
 }
-"""Gross errors: what makes one and says how it is named, and the shapes and contents of surveys that have them."""
+"""Gross errors: what makes one and says how it is named, and the shapes and contents of surveys
+that have them."""
 
 
 READ = ("degrees", "units")  # kinds of errors that a reader may mend
@@ -226,7 +245,11 @@ def _by_command(folder: Path, file: Path) -> tuple[list[str], np.ndarray | None]
     options = ["--constraints", str(file), "--output", str(folder / "out")]
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
         status = run([str(folder / "model"), *options])
-    notes = [line for line in said.getvalue().splitlines() if re.match(r"(jaxba-solve: )?(note|error|warning)", line)]
+    notes = [
+        line
+        for line in said.getvalue().splitlines()
+        if re.match(r"(jaxba-solve: )?(note|error|warning)", line)
+    ]
     if status:
         return [*notes, f"error: {said.getvalue().strip().splitlines()[-1]}"], None
     return notes, geometry.camera_centers(jaxba.read_colmap(folder / "out").cameras)
@@ -248,18 +271,27 @@ def surveys_of(kinds: Sequence[str], count: int, seed: int) -> list[tuple[str, S
 def clean_surveys(count: int, seed: int) -> list[Survey]:
     """Surveys without an error, of every shape and content in turn."""
     every = [(shape, content) for shape, kind in SHAPES.items() for content in kind.contents]
-    return [draw(*every[number % len(every)], 100_000 * seed + 50_000 + number) for number in range(count)]
+    return [
+        draw(*every[number % len(every)], 100_000 * seed + 50_000 + number)
+        for number in range(count)
+    ]
 
 
-def table(kinds: Sequence[str], results: dict[str, list[tuple[Outcome, bool]]], clean: list[Outcome]) -> str:
+def table(
+    kinds: Sequence[str], results: dict[str, list[tuple[Outcome, bool]]], clean: list[Outcome]
+) -> str:
     """Lines of kinds, surveys, what was said and named, and where cameras are."""
     lines = [f"{'kind':10} surveys  said  named  cameras off, metres: median, largest"]
     for kind in kinds:
         found = results[kind]
-        lines.append(f"{kind:10} {_line([one for one, _ in found], sum(named for _, named in found))}")
+        lines.append(
+            f"{kind:10} {_line([one for one, _ in found], sum(named for _, named in found))}"
+        )
     every = [pair for kind in kinds for pair in results[kind]]
     if every:
-        lines.append(f"{'all':10} {_line([one for one, _ in every], sum(named for _, named in every))}")
+        lines.append(
+            f"{'all':10} {_line([one for one, _ in every], sum(named for _, named in every))}"
+        )
     if clean:
         lines.append(f"{'clean':10} {_line(clean, 0)}")
     return "\n".join(lines)
@@ -273,13 +305,21 @@ def _line(found: list[Outcome], named: int) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the benchmark. Exit status 1 if under 95 percent are named, or over 1 percent of clean ones have a note."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Runs the benchmark. Exit status 1 if under 95 percent are named, or over 1 percent of clean
+    ones have a note."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--surveys", type=int, default=100, help="with an error")
     parser.add_argument("--clean", type=int, default=100, help="without one")
     parser.add_argument("--kinds", default=",".join(KINDS), help="of errors, between commas")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command", type=int, default=10, help="every which survey goes through jaxba-solve; 0: none")
+    parser.add_argument(
+        "--command",
+        type=int,
+        default=10,
+        help="every which survey goes through jaxba-solve; 0: none",
+    )
     parser.add_argument("--verbose", action="store_true", help="print what is said of every survey")
     args = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
@@ -288,14 +328,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     results: dict[str, list[tuple[Outcome, bool]]] = {kind: [] for kind in kinds}
     clean = []
     for number, (kind, survey, words) in enumerate(surveys_of(kinds, args.surveys, args.seed)):
-        outcome = looked_at(survey, bool(args.command) and number % args.command == args.command - 1)
+        outcome = looked_at(
+            survey, bool(args.command) and number % args.command == args.command - 1
+        )
         outcome = replace(outcome, mended=kind in READ and outcome.away < outcome.limit)
         named = outcome.names(words) or outcome.mended
         results[kind].append((outcome, named))
         if args.verbose or not named:
             _print(f"{kind} {'named' if named else 'NOT NAMED'} in {survey.heading}", outcome)
     for number, survey in enumerate(clean_surveys(args.clean, args.seed)):
-        outcome = looked_at(survey, bool(args.command) and number % args.command == args.command - 1)
+        outcome = looked_at(
+            survey, bool(args.command) and number % args.command == args.command - 1
+        )
         clean.append(outcome)
         if args.verbose or outcome.said:
             _print(f"clean {'NOTED' if outcome.said else 'quiet'}: {survey.heading}", outcome)

@@ -1,7 +1,8 @@
-"""Random surveys as users have them: a COLMAP model, a log, control points with marks, check points, depth maps, YAML.
+"""Random surveys as users have them: a COLMAP model, a log, control points with marks, check
+points, depth maps, YAML.
 
-What is true is made here, without the library: its projection, its coordinates on the earth (by pyproj) and its files.
-Scenes of a shape share their sizes, so that few programs are compiled."""
+What is true is made here, without the library: its projection, its coordinates on the earth (by
+pyproj) and its files. Scenes of a shape share their sizes, so that few programs are compiled."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ class Shape:
     images: int
     points: int
     lens: str  # a camera model of COLMAP
-    contents: tuple[str, ...]  # surveys that it is for, words of `Survey.content` with blanks between
+    # surveys that it is for, words of `Survey.content` with blanks between
+    contents: tuple[str, ...]
     size: tuple[int, int]  # of images, pixels
 
 
@@ -81,7 +83,9 @@ class Survey:
     marks: Float[np.ndarray, "marks 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     mark_system: str = ""  # first line of the file
     mark_seen: Int[np.ndarray, "marks views"] = field(default_factory=lambda: np.zeros((0, 0), int))
-    mark_pixels: Float[np.ndarray, "marks views 2"] = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    mark_pixels: Float[np.ndarray, "marks views 2"] = field(
+        default_factory=lambda: np.zeros((0, 0, 2))
+    )
     checks: list[str] = field(default_factory=list)
     maps: list[np.ndarray] = field(default_factory=list)
 
@@ -109,7 +113,11 @@ def draw(shape: str, content: str, seed: int) -> Survey:
     if kind.lens != "PINHOLE":
         lens["k1"] = rng.uniform(-0.03, 0.03)
     if kind.lens == "OPENCV":
-        lens |= {"k2": rng.uniform(-0.01, 0.01), "p1": rng.normal(0, 1e-4), "p2": rng.normal(0, 1e-4)}
+        lens |= {
+            "k2": rng.uniform(-0.01, 0.01),
+            "p1": rng.normal(0, 1e-4),
+            "p2": rng.normal(0, 1e-4),
+        }
     turns, centres, sample = _AT[shape](kind, rng, width / focal)
     seen, _ = _pattern(shape)
     candidates = sample(60 * kind.points, rng)
@@ -155,7 +163,9 @@ def _block(kind: Shape, rng: np.random.Generator, view: float, strips: int = 3) 
     wide = height * view
     per_strip = kind.images // strips
     overlap = 0.8 if strips > 1 else 0.88
-    along, across = np.meshgrid(np.arange(per_strip) * (1 - overlap) * wide, np.arange(strips) * 0.3 * wide)
+    along, across = np.meshgrid(
+        np.arange(per_strip) * (1 - overlap) * wide, np.arange(strips) * 0.3 * wide
+    )
     centres = np.stack([along.ravel(), across.ravel(), np.full(kind.images, height)], axis=1)
     if strips == 1:  # a corridor that bends
         centres[:, 1] = 0.3 * wide * np.sin(np.linspace(0, np.pi, kind.images))
@@ -191,7 +201,9 @@ def _turned(turns: np.ndarray, centres: np.ndarray, sample, rng: np.random.Gener
     return turns @ azimuth.as_matrix().T, azimuth.apply(centres), turned_sample
 
 
-def _facade(kind: Shape, rng: np.random.Generator, view: float, width: float = 40.0, deep: float = 3.0) -> tuple:
+def _facade(
+    kind: Shape, rng: np.random.Generator, view: float, width: float = 40.0, deep: float = 3.0
+) -> tuple:
     distance = 0.9 * width / view
     angles = np.linspace(-0.7, 0.7, kind.images) + rng.normal(0, 0.03, kind.images)
     heights = width * rng.uniform(0.03, 0.35, kind.images)
@@ -215,7 +227,9 @@ def _room(kind: Shape, rng: np.random.Generator, view: float) -> tuple:
         places = sample(count, rng)
         places[:, 2] += 0.2 * np.sin(2 * places[:, 0] + phase[0])
         ahead = places - centres.mean(axis=0)
-        waves = 1 + 0.2 * np.sin(1.5 * places[:, :1] + phase[0]) * np.cos(1.5 * places[:, 2:] + phase[1])
+        waves = 1 + 0.2 * np.sin(1.5 * places[:, :1] + phase[0]) * np.cos(
+            1.5 * places[:, 2:] + phase[1]
+        )
         return centres.mean(axis=0) + ahead * waves
 
     return turns, centres, surface
@@ -225,7 +239,8 @@ _AT = {"block": _block, "strip": _strip, "facade": _facade, "room": _room}
 
 
 def _looking(ahead: np.ndarray) -> np.ndarray:
-    """The rotation from the world to a camera (x to the right, y down) that looks in a direction."""
+    """The rotation from the world to a camera (x to the right, y down) that looks in a
+    direction."""
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
@@ -249,7 +264,8 @@ def projected(
 
 @functools.cache
 def _pattern(shape: str) -> tuple[Int[np.ndarray, "points views"], Int[np.ndarray, "marks views"]]:
-    """Which images see each point and mark of every scene of a shape, so that all of them have the same sizes."""
+    """Which images see each point and mark of every scene of a shape, so that all of them have the
+    same sizes."""
     kind = SHAPES[shape]
     rng = np.random.default_rng(0)
     turns, centres, sample = _AT[shape](kind, rng, 1.25)
@@ -258,7 +274,9 @@ def _pattern(shape: str) -> tuple[Int[np.ndarray, "points views"], Int[np.ndarra
     _, visible = _visible(kind.size, lens, turns, centres, candidates, 0.15)
     some = np.flatnonzero(visible.sum(axis=1) >= VIEWS)[: kind.points]
     assert len(some) == kind.points
-    spread = _spread(candidates[:1000], [visible[:1000].sum(axis=1) >= MARK_VIEWS] * (CONTROLS + CHECKS))
+    spread = _spread(
+        candidates[:1000], [visible[:1000].sum(axis=1) >= MARK_VIEWS] * (CONTROLS + CHECKS)
+    )
     return _chosen(visible[some], VIEWS, rng), _chosen(visible[spread], MARK_VIEWS, rng)
 
 
@@ -314,16 +332,23 @@ def _visible(
     return pixels, inside.all(axis=-1) & (depths > 0)
 
 
-def on_earth(survey: Survey, places: Float[np.ndarray, "n 3"], crs: str) -> Float[np.ndarray, "n 3"]:
-    """Metres east, north and up of the origin in a coordinate system, in the order east, north, height."""
+def on_earth(
+    survey: Survey, places: Float[np.ndarray, "n 3"], crs: str
+) -> Float[np.ndarray, "n 3"]:
+    """Metres east, north and up of the origin in a coordinate system, in the order east, north,
+    height."""
     longitude, latitude, height = survey.origin
     pipeline = (
-        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={longitude} +lat_0={latitude} "
-        f"+h_0={height} +step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={longitude} "
+        f"+lat_0={latitude} "
+        f"+h_0={height} +step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad "
+        "+xy_out=deg"
     )
     found = pyproj.Transformer.from_pipeline(pipeline).transform(*places.T)
     target = pyproj.CRS(crs).to_3d()
-    return np.stack(pyproj.Transformer.from_crs("EPSG:4979", target, always_xy=True).transform(*found), axis=1)
+    return np.stack(
+        pyproj.Transformer.from_crs("EPSG:4979", target, always_xy=True).transform(*found), axis=1
+    )
 
 
 def _add_log(survey: Survey, rng: np.random.Generator) -> None:
@@ -352,8 +377,11 @@ def _add_marks(survey: Survey, candidates: np.ndarray, rng: np.random.Generator)
     survey.mark_system = "local" if survey.local else survey.crs
 
 
-def depth_maps(survey: Survey, size: tuple[int, int], value, rng: np.random.Generator) -> list[np.ndarray]:
-    """A map for each image with `value(depth)` at the nearest of its points, and noise of 2 percent."""
+def depth_maps(
+    survey: Survey, size: tuple[int, int], value, rng: np.random.Generator
+) -> list[np.ndarray]:
+    """A map for each image with `value(depth)` at the nearest of its points, and noise of 2
+    percent."""
     scale = np.array(size) / survey.size
     _, depths = projected(survey.lens, survey.turns, survey.centres, survey.points)
     columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
@@ -369,8 +397,8 @@ def depth_maps(survey: Survey, size: tuple[int, int], value, rng: np.random.Gene
 
 
 def write(survey: Survey, folder: Path, *, bent: bool = True) -> Path:
-    """Writes the model `model`, in a frame of its own, and the files of the survey; its YAML file. Unless it is to be
-    `bent`, as images alone bend it, the model is true."""
+    """Writes the model `model`, in a frame of its own, and the files of the survey; its YAML file.
+    Unless it is to be `bent`, as images alone bend it, the model is true."""
     rng = np.random.default_rng([survey.seed, 7])
     _write_model(survey, folder / "true")
     with warnings.catch_warnings():
@@ -382,7 +410,8 @@ def write(survey: Survey, folder: Path, *, bent: bool = True) -> Path:
         system = "" if geographic else f", crs: {survey.crs}"
         text.append(f"position_priors: {{file: log.csv, stddev: {survey.log_stddev}{system}}}")
         rows = [
-            f"{name},{','.join(map(repr, row))}" for name, row in zip(survey.names, survey.log.tolist(), strict=True)
+            f"{name},{','.join(map(repr, row))}"
+            for name, row in zip(survey.names, survey.log.tolist(), strict=True)
         ]
         (folder / "log.csv").write_text("\n".join([survey.log_header, *rows, ""]))
     if len(survey.marks):
@@ -391,7 +420,9 @@ def write(survey: Survey, folder: Path, *, bent: bool = True) -> Path:
         lines = [survey.mark_system]
         for mark, name in enumerate(survey.mark_names):
             place = " ".join(map(repr, survey.marks[mark].tolist()))
-            for image, (x, y) in zip(survey.mark_seen[mark], survey.mark_pixels[mark].tolist(), strict=True):
+            for image, (x, y) in zip(
+                survey.mark_seen[mark], survey.mark_pixels[mark].tolist(), strict=True
+            ):
                 lines.append(f"{place} {x:.2f} {y:.2f} {survey.names[image]} {name}")
         (folder / "gcp_list.txt").write_text("\n".join([*lines, ""]))
     if survey.maps:
@@ -408,7 +439,9 @@ def _write_model(survey: Survey, folder: Path) -> None:
     folder.mkdir(parents=True)
     kind = SHAPES[survey.shape].lens
     parameters = " ".join(repr(float(survey.lens[name])) for name in OF_LENS[kind])
-    (folder / "cameras.txt").write_text(f"1 {kind} {survey.size[0]} {survey.size[1]} {parameters}\n")
+    (folder / "cameras.txt").write_text(
+        f"1 {kind} {survey.size[0]} {survey.size[1]} {parameters}\n"
+    )
     lines, tracks = [], [[] for _ in survey.points]
     for image, name in enumerate(survey.names):
         x, y, z, w = Rotation.from_matrix(survey.turns[image]).as_quat().tolist()
@@ -423,12 +456,15 @@ def _write_model(survey: Survey, folder: Path) -> None:
     (folder / "images.txt").write_text("\n".join([*lines, ""]))
     rows = []
     for point, place in enumerate(survey.points.tolist()):
-        rows.append(f"{point + 1} {' '.join(map(repr, place))} 128 128 128 0.5 {' '.join(tracks[point])}")
+        rows.append(
+            f"{point + 1} {' '.join(map(repr, place))} 128 128 128 0.5 {' '.join(tracks[point])}"
+        )
     (folder / "points3D.txt").write_text("\n".join([*rows, ""]))
 
 
 def _write_start(folder: Path, rng: np.random.Generator, bent: bool) -> None:
-    """What structure from motion makes of the images alone: the minimum without the survey, in a frame of its own."""
+    """What structure from motion makes of the images alone: the minimum without the survey, in a
+    frame of its own."""
     found = jaxba.read_colmap(folder / "true")
     if bent:
         points = np.asarray(found.points)

@@ -1,11 +1,12 @@
-"""A whole training of the game by jaxba's loop and by SAC of sbx: steps and updates a second, seconds to a score.
+"""A whole training of the game by jaxba's loop and by SAC of sbx: steps and updates a second,
+seconds to a score.
 
     python -m benchmarks.trainer [--envs 64] [--updates 32] [--limit 600] [--out FILE]
 
-Needs sbx-rl and the extra gym in the same Python. Both play the same scenes with networks of two layers of 64, batches
-of 256 and as many updates after each vector step, and are stopped now and then for the score of the mean action on
-held-out scenes; its time and that of compilation are not counted. The score to reach is `TARGET` of Ceres' rule's.
-"""
+Needs sbx-rl and the extra gym in the same Python. Both play the same scenes with networks of two
+layers of 64, batches of 256 and as many updates after each vector step, and are stopped now and
+then for the score of the mean action on held-out scenes; its time and that of compilation are not
+counted. The score to reach is `TARGET` of Ceres' rule's."""
 
 from __future__ import annotations
 
@@ -80,13 +81,17 @@ def ours(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
     loop = dataclasses.replace(config.loop, steps_per_chunk=EVERY)
     with numerics("float64"):
         state = start(config.sac, loop, env, jax.random.key(1))
-        state, _ = jax.block_until_ready(run_chunk(config.sac, loop, env, state))  # compiles; not counted as time
+        # compiles; not counted as time
+        state, _ = jax.block_until_ready(run_chunk(config.sac, loop, env, state))
     while run.seconds < limit and not run.reached > 0:
         began = time.perf_counter()
         with numerics("float64"):
             state, _ = jax.block_until_ready(run_chunk(config.sac, loop, env, state))
         run.seconds += time.perf_counter() - began
-        run.steps, run.updates = run.steps + EVERY * env.num_envs, run.updates + EVERY * loop.updates_per_step
+        run.steps, run.updates = (
+            run.steps + EVERY * env.num_envs,
+            run.updates + EVERY * loop.updates_per_step,
+        )
         yield judged(run, score(env, learned_from(env.config.agent, state.learner.actor)), target)
 
 
@@ -115,14 +120,20 @@ def peer(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
         model.learn(EVERY * env.num_envs, reset_num_timesteps=False)
         jax.block_until_ready(model.policy.actor_state.params)
         run.seconds += time.perf_counter() - began
-        run.steps, run.updates = run.steps + model.num_timesteps - steps, run.updates + model._n_updates - updates
+        run.steps, run.updates = (
+            run.steps + model.num_timesteps - steps,
+            run.updates + model._n_updates - updates,
+        )
         yield judged(run, score(env, policy_of(env, model.policy.actor_state.params)), target)
 
 
 def policy_of(env: PresetGame, actor: Any) -> LearnedPolicy:
-    """The policy of an actor of sbx: hidden layers, then one layer for the mean and one for the deviation."""
+    """The policy of an actor of sbx: hidden layers, then one layer for the mean and one for the
+    deviation."""
     stack = [actor["params"][f"Dense_{k}"] for k in range(len(actor["params"]))]
-    *hidden, mean, deviation = [Layer(np.asarray(one["kernel"]), np.asarray(one["bias"])) for one in stack]
+    *hidden, mean, deviation = [
+        Layer(np.asarray(one["kernel"]), np.asarray(one["bias"])) for one in stack
+    ]
     last = Layer(*(np.concatenate(both, axis=-1) for both in zip(mean, deviation, strict=True)))
     return LearnedPolicy((*hidden, last), env.config.agent)
 
@@ -138,14 +149,24 @@ def judged(run: Run, found: float, target: float) -> Run:
 def main() -> None:
     """Prints the table."""
     args = tyro.cli(Arguments, description=__doc__)
-    sizes = f"bank.scenes={args.scenes}", f"envs={args.envs}", f"loop.updates_per_step={args.updates}"
+    sizes = (
+        f"bank.scenes={args.scenes}",
+        f"envs={args.envs}",
+        f"loop.updates_per_step={args.updates}",
+    )
     env = jaxba.make_env("default", *sizes, "sac.batch=256", report=print)
     rule = score(env, jaxba.make_policy("ceres"))
-    print(f"held-out scenes: Ceres' rule takes {rule:.2f} iterations, to reach {TARGET * rule:.2f}", flush=True)
+    print(
+        f"held-out scenes: Ceres' rule takes {rule:.2f} iterations, to reach {TARGET * rule:.2f}",
+        flush=True,
+    )
     metrics, done = [], {}
     for name, trainer in (("jaxba", ours), ("sbx", peer)):
         for run in trainer(env, args.limit, TARGET * rule):
-            print(f"{name}: {run.seconds:.1f} s, {run.steps} steps, score {run.scores[-1]:.2f}", flush=True)
+            print(
+                f"{name}: {run.seconds:.1f} s, {run.steps} steps, score {run.scores[-1]:.2f}",
+                flush=True,
+            )
             done[name] = run
         run = done[name]
         metrics += [
@@ -153,7 +174,9 @@ def main() -> None:
             Metric(f"trainer/{name}: updates", run.updates / run.seconds, "1/s", "higher"),
             Metric(f"trainer/{name}: to the score", run.reached, "s", "lower"),
         ]
-    ratio = done["jaxba"].updates / done["jaxba"].seconds / (done["sbx"].updates / done["sbx"].seconds)
+    ratio = (
+        done["jaxba"].updates / done["jaxba"].seconds / (done["sbx"].updates / done["sbx"].seconds)
+    )
     metrics.append(Metric("trainer/jaxba over sbx: updates", ratio, "ratio", "higher", target=5.0))
     print(to_text(metrics))
     if args.out:

@@ -1,8 +1,9 @@
 """Tables of options and commands for the documents, made from the source when the site is built.
 
-A line `<!-- fields of: jaxba.StepOptions -->` in a page becomes a table of the fields of that dataclass;
-`<!-- options of: jaxba.cli.solve.Arguments -->` one of a command's options. The source is read, not imported, so that a
-build needs no JAX. mkdocs calls `on_page_markdown` (`hooks` in mkdocs.yml).
+A line `<!-- fields of: jaxba.StepOptions -->` in a page becomes a table of the fields of that
+dataclass; `<!-- options of: jaxba.cli.solve.Arguments -->` one of a command's options. The source
+is read, not imported, so that a build needs no JAX. mkdocs calls `on_page_markdown` (`hooks` in
+mkdocs.yml).
 
 `python docs/generate.py` counts the words of README and of the pages that are written by hand.
 """
@@ -67,9 +68,15 @@ def table(path: str, *, command: bool) -> str:
         name = f"`{_option(field.name, annotation)}`" if command else f"`{field.name}`"
         choices = ", ".join(f"`{choice}`" for choice in _choices(found, annotation))
         words = " ".join(field.docstring.value.split()) if field.docstring else ""
-        meaning = f"{_plain(words)} One of {choices}." if choices and _any_missing(choices, words) else _plain(words)
+        meaning = (
+            f"{_plain(words)} One of {choices}."
+            if choices and _any_missing(choices, words)
+            else _plain(words)
+        )
         shown = "" if default in ("", "None") else f"`{default}`"
-        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in (name, shown, meaning)) + " |")
+        rows.append(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in (name, shown, meaning)) + " |"
+        )
     return "\n".join(rows)
 
 
@@ -98,11 +105,14 @@ def _value(owner: Any, value: Any) -> str:
 
 
 def _text(module: Any, value: ast.expr) -> str:
-    """What an expression stands for where it names constants, or fields of instances; else its own text."""
+    """What an expression stands for where it names constants, or fields of instances; else its own
+    text."""
     if isinstance(value, ast.Constant) and isinstance(value.value, str):
         return value.value
     if isinstance(value, ast.Call) and ast.unparse(value.func).endswith("field"):
-        factory = next((word.value for word in value.keywords if word.arg == "default_factory"), None)
+        factory = next(
+            (word.value for word in value.keywords if word.arg == "default_factory"), None
+        )
         return f"{ast.unparse(factory)}()" if factory is not None else ""
     if isinstance(value, ast.Name):
         found = _member(module, value.id)
@@ -117,7 +127,8 @@ def _text(module: Any, value: ast.expr) -> str:
 
 
 def _class_of(module: Any, value: ast.expr) -> Any:
-    """The class of an instance whose fields have their defaults; None where that is not told by the source."""
+    """The class of an instance whose fields have their defaults; None where that is not told by the
+    source."""
     if isinstance(value, ast.Name):
         found = _member(module, value.id)
         if found is None or not found.is_attribute:
@@ -129,16 +140,28 @@ def _class_of(module: Any, value: ast.expr) -> Any:
         if not field:
             return None
         call = ast.parse(str(field.value), mode="eval").body
-        factory = [word.value for word in getattr(call, "keywords", []) if word.arg == "default_factory"]
-        return _class_of(kind.parent, ast.Call(factory[0], [], [])) if factory else _class_of(kind.parent, call)
-    if isinstance(value, ast.Call) and not value.args and not value.keywords and isinstance(value.func, ast.Name):
+        factory = [
+            word.value for word in getattr(call, "keywords", []) if word.arg == "default_factory"
+        ]
+        return (
+            _class_of(kind.parent, ast.Call(factory[0], [], []))
+            if factory
+            else _class_of(kind.parent, call)
+        )
+    if (
+        isinstance(value, ast.Call)
+        and not value.args
+        and not value.keywords
+        and isinstance(value.func, ast.Name)
+    ):
         found = _member(module, value.func.id)
         return found if found is not None and found.is_class else None
     return None
 
 
 def _member(owner: Any, name: str) -> Any:
-    """A member of a module or class by name, what it is imported from included; None where there is none."""
+    """A member of a module or class by name, what it is imported from included; None where there is
+    none."""
     try:
         found = owner[name]
         return found.final_target if found.is_alias else found

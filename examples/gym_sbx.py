@@ -3,8 +3,8 @@
     pip install jaxba[gym] sbx-rl
     python examples/gym_sbx.py [--seconds 60] [--envs 32]
 
-Prints iterations per episode at the start and at the end, beside those of Ceres' rule on the same scenes.
-"""
+Prints iterations per episode at the start and at the end, beside those of Ceres' rule on the same
+scenes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ from jaxba.game.scene_bank import BankConfig, make_split
 
 
 class ForStableBaselines(VecEnv):
-    """A Gymnasium vector environment that resets in the same step, in the form that Stable-Baselines3 has for it."""
+    """A Gymnasium vector environment that resets in the same step, in the form that
+    Stable-Baselines3 has for it."""
 
     def __init__(self, envs: GymVectorGame) -> None:
         self.envs = envs
@@ -52,7 +53,10 @@ class ForStableBaselines(VecEnv):
             infos[k] = {
                 "terminal_observation": found["final_obs"][k],
                 "TimeLimit.truncated": bool(truncated[k]),
-                **{name: float(found["final_info"][name][k]) for name in ("length", "success", "ceres")},
+                **{
+                    name: float(found["final_info"][name][k])
+                    for name in ("length", "success", "ceres")
+                },
             }
         return observation, reward.astype(np.float32), terminated | truncated, infos
 
@@ -65,7 +69,9 @@ class ForStableBaselines(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         raise TypeError("the environments are one program")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         raise TypeError("the environments are one program")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
@@ -92,9 +98,13 @@ class Watch(BaseCallback):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--seconds", type=float, default=60.0, help="of training, compilation included")
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="of training, compilation included"
+    )
     parser.add_argument("--envs", type=int, default=32, help="scenes in play")
-    parser.add_argument("--scenes", type=int, default=400, help="scenes drawn; about a third of them are usable")
+    parser.add_argument(
+        "--scenes", type=int, default=400, help="scenes drawn; about a third of them are usable"
+    )
     arguments = parser.parse_args()
 
     kind = SceneClass(5, 20)
@@ -102,21 +112,28 @@ def main() -> None:
     options = config.agent.step_options(StepOptions())
     print("making scenes", flush=True)
     bank = BankConfig(kind=kind, scenes=arguments.scenes)
-    with jax.enable_x64(True):  # the game counts in float64, but sbx in float32: the adapter keeps them apart
+    # the game counts in float64, but sbx in float32: the adapter keeps them apart
+    with jax.enable_x64(True):
         split = make_split(bank, jax.random.key(0), options, config.max_iterations)
         game = make_game(config, kind, split.train, arguments.envs)
     envs = ForStableBaselines(GymVectorGame(game, "SameStep"))
 
     watch = Watch(arguments.seconds)
     model = SAC("MlpPolicy", envs, learning_starts=1000, gradient_steps=4, seed=0)
-    print(f"training on {len(split.train.initial_cost)} scenes for {arguments.seconds:g} s", flush=True)
+    print(
+        f"training on {len(split.train.initial_cost)} scenes for {arguments.seconds:g} s",
+        flush=True,
+    )
     model.learn(10**9, callback=watch)
     if not watch.lengths:
         sys.exit("not one episode ended: give it more --seconds")
     tenth = max(1, len(watch.lengths) // 10)
     print(f"{model.num_timesteps} iterations, {len(watch.lengths)} episodes")
     print(f"iterations per episode: first tenth {np.mean(watch.lengths[:tenth]):.1f}, ", end="")
-    print(f"last tenth {np.mean(watch.lengths[-tenth:]):.1f}; Ceres' rule {np.mean(watch.rule[-tenth:]):.1f}")
+    print(
+        f"last tenth {np.mean(watch.lengths[-tenth:]):.1f}; Ceres' rule "
+        f"{np.mean(watch.rule[-tenth:]):.1f}"
+    )
 
 
 if __name__ == "__main__":

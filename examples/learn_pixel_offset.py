@@ -2,10 +2,10 @@
 
     python examples/learn_pixel_offset.py
 
-A detector that puts every key-point some pixels too far to the right leaves hardly a trace in the reprojection errors:
-a solve turns and moves the cameras instead. Their measured positions know better. Here the offset is what makes the
-solved positions fit the measured ones, found by Adam with gradients through the solve.
-"""
+A detector that puts every key-point some pixels too far to the right leaves hardly a trace in the
+reprojection errors: a solve turns and moves the cameras instead. Their measured positions know
+better. Here the offset is what makes the solved positions fit the measured ones, found by Adam with
+gradients through the solve."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ RATE, STEPS = 0.3, 60
 def main() -> float:
     """Prints the offset of every step, and returns the last."""
     jax.config.update("jax_enable_x64", True)
-    config = jaxba.SceneConfig(cameras=12, points=150, mean_track=6.0, trajectory="orbit", max_depth=10.0)
+    config = jaxba.SceneConfig(
+        cameras=12, points=150, mean_track=6.0, trajectory="orbit", max_depth=10.0
+    )
     scene, truth = jaxba.random_scene_with_truth(config, seed=0)
     observations = np.add(scene.observations, [OFFSET, 0.0])
     problem = scene.replace(cameras=truth.cameras, points=truth.points, observations=observations)

@@ -1,4 +1,5 @@
-"""Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
+"""Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or
+written."""
 
 from __future__ import annotations
 
@@ -115,7 +116,8 @@ _LATE = {
     "training.api": ("make_env", "train"),
     "viewer.notebook": ("view",),
 }
-"""Public names that most solves do without, by module; they are loaded when they are first asked for."""
+"""Public names that most solves do without, by module; they are loaded when they are first asked
+for."""
 
 
 def __getattr__(name: str) -> Any:

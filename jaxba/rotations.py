@@ -11,11 +11,13 @@ from jax import Array
 from jaxtyping import Float
 
 SMALL_ANGLE_SQUARED = 1e-6
-"""Squared angle (radians^2) below which functions of the angle are Taylor series, with an error below 1e-20."""
+"""Squared angle (radians^2) below which functions of the angle are Taylor series, with an error
+below 1e-20."""
 
 
 def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
-    """`sin(a)/a`, `(1-cos(a))/a^2` and `(a-sin(a))/a^3` at angle a = sqrt(squared), smooth through zero."""
+    """`sin(a)/a`, `(1-cos(a))/a^2` and `(a-sin(a))/a^3` at angle a = sqrt(squared), smooth through
+    zero."""
     small = squared < SMALL_ANGLE_SQUARED
     safe = jnp.where(small, jnp.ones_like(squared), squared)
     angle = jnp.sqrt(safe)
@@ -23,7 +25,9 @@ def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
     first = jnp.where(small, 1 - squared / 6 * (1 - squared / 20), jnp.sin(angle) / angle)
     # 2 sin^2(a/2) instead of 1 - cos(a): no cancellation
     second = jnp.where(small, 0.5 - squared / 24 * (1 - squared / 30), 2 * half * half / safe)
-    third = jnp.where(small, 1 / 6 - squared / 120 * (1 - squared / 42), (angle - jnp.sin(angle)) / (safe * angle))
+    third = jnp.where(
+        small, 1 / 6 - squared / 120 * (1 - squared / 42), (angle - jnp.sin(angle)) / (safe * angle)
+    )
     return first, second, third
 
 
@@ -54,7 +58,8 @@ def left_jacobian(angle_axis: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
 
 
 def left_jacobian_inverse(angle_axis: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
-    """Inverse of `left_jacobian` (Sola et al., eq. 146); singular where the angle is a multiple of 2 pi."""
+    """Inverse of `left_jacobian` (Sola et al., eq. 146); singular where the angle is a multiple of
+    2 pi."""
     squared = jnp.sum(angle_axis * angle_axis, axis=0)
     small = squared < SMALL_ANGLE_SQUARED
     safe = jnp.where(small, jnp.ones_like(squared), squared)
@@ -76,7 +81,9 @@ def compose_left(step: Float[Array, "3 n"], angle_axis: Float[Array, "3 n"]) -> 
     small = squared < SMALL_ANGLE_SQUARED
     norm = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), squared))
     # asin's series: the angle is 2 asin(|v|), so angle / |v| = 2 (1 + |v|^2/6 + 3|v|^4/40)
-    scale = jnp.where(small, 2 + squared * (1 / 3 + 3 * squared / 20), 2 * jnp.arctan2(norm, real) / norm)
+    scale = jnp.where(
+        small, 2 + squared * (1 / 3 + 3 * squared / 20), 2 * jnp.arctan2(norm, real) / norm
+    )
     return scale * imaginary
 
 
@@ -91,7 +98,8 @@ def _quaternion(angle_axis: Array) -> tuple[Array, Array]:
 
 
 def angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
-    """Angle-axis vectors with angles in [0, pi], computed from the quaternion's largest entry (Shepperd 1978)."""
+    """Angle-axis vectors with angles in [0, pi], computed from the quaternion's largest entry
+    (Shepperd 1978)."""
     m = rotation
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     squares = jnp.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)

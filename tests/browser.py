@@ -1,4 +1,5 @@
-"""Headless Chromium for the tests of pages: what a page shows, says in its console, and asks the network for."""
+"""Headless Chromium for the tests of pages: what a page shows, says in its console, and asks the
+network for."""
 
 from __future__ import annotations
 
@@ -12,8 +13,19 @@ from typing import Any
 import pytest
 
 FLAGS = (
-    *("--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--force-device-scale-factor=1", "--window-size=1400,1000"),
+    *(
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+    ),
+    *(
+        "--disable-component-update",
+        "--disable-sync",
+        "--force-device-scale-factor=1",
+        "--window-size=1400,1000",
+    ),
 )
 
 
@@ -27,7 +39,9 @@ def chromium(*flags: str) -> Iterator[Any]:
     options = webdriver.ChromeOptions()
     options.binary_location = browser
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    with tempfile.TemporaryDirectory(prefix="jaxba-chromium-", ignore_cleanup_errors=True) as profile:
+    with tempfile.TemporaryDirectory(
+        prefix="jaxba-chromium-", ignore_cleanup_errors=True
+    ) as profile:
         for flag in (*FLAGS, *flags, f"--user-data-dir={profile}"):
             options.add_argument(flag)
         page = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
@@ -43,7 +57,14 @@ def complaints(page: Any) -> list[str]:
 
 
 def requests(page: Any) -> list[str]:
-    """Addresses that were asked for since the last call, but those of this page's own files and of its own text."""
+    """Addresses that were asked for since the last call, but those of this page's own files and of
+    its own text."""
     messages = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
-    asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
-    return [url for url in asked if not url.startswith(("file:", "data:", "blob:", "about:", "chrome:"))]
+    asked = [
+        m["params"]["request"]["url"]
+        for m in messages
+        if m["method"] == "Network.requestWillBeSent"
+    ]
+    return [
+        url for url in asked if not url.startswith(("file:", "data:", "blob:", "about:", "chrome:"))
+    ]

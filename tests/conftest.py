@@ -1,8 +1,9 @@
-"""Numbers are float64, types are checked where people call, and what was compiled once is kept for the next session.
+"""Numbers are float64, types are checked where people call, and what was compiled once is kept for
+the next session.
 
-Programs are compiled without LLVM's optimisations, unless `--compilation full` is given: they compute the same, and
-most of the time of all these tests is compilation. `.ci/run` has the slow ones, and those of the step, compiled fully.
-"""
+Programs are compiled without LLVM's optimisations, unless `--compilation full` is given: they
+compute the same, and most of the time of all these tests is compilation. `.ci/run` has the slow
+ones, and those of the step, compiled fully."""
 
 from __future__ import annotations
 
@@ -35,8 +36,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     # a worker of pytest-xdist inherits the flags
     if config.getoption("compilation") == "quick" and not hasattr(config, "workerinput"):
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for workers, children, and what is imported from here on
+        os.environ["XLA_FLAGS"] = (
+            f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
+        )
+    # for workers, children, and what is imported from here on
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", 3)
     cache = getattr(config, "cache", None)
@@ -50,26 +54,35 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _flags_of_level_quick() -> str:
-    """XLA's flags by which all programs of a process and its children have `compiler_options("quick")`, and more.
+    """XLA's flags by which all programs of a process and its children have
+    `compiler_options("quick")`, and more.
 
-    XLA ends a process whose flags it does not know, so another process asks which ones it knows. That one may import
-    jaxba, too: here it must not be imported before the import hook of jaxtyping is there.
-    """
+    XLA ends a process whose flags it does not know, so another process asks which ones it knows.
+    That one may import jaxba, too: here it must not be imported before the import hook of jaxtyping
+    is there."""
     code = (
-        "from jaxba.runtime.compilation import compiler_options; from jaxba.runtime.jit import known_options; "
-        # all in one piece: two workers on two cores gain nothing from compiling the pieces of a program in parallel
-        "print(compiler_options('quick') | known_options({'xla_cpu_parallel_codegen_split_count': 1}))"
+        "from jaxba.runtime.compilation import compiler_options; from jaxba.runtime.jit import "
+        "known_options; "
+        # all in one piece: two workers on two cores gain nothing from compiling the pieces of a
+        # program in parallel
+        "print(compiler_options('quick') | known_options({'xla_cpu_parallel_codegen_split_count': "
+        "1}))"
     )
-    told = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True).stdout
-    return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
+    told = subprocess.run(
+        [sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
+    return " ".join(
+        f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items()
+    )
 
 
 WHOLE_ROOMS = ("lm", "linear")
-"""Of these rooms `-m sample` has the first case of each test, of the others the first test of each file."""
+"""Of these rooms `-m sample` has the first case of each test, of the others the first test of each
+file."""
 
 LABORATORY = {"methods", "kitti", "game", "training", "peers", "bench", "paper"}
-"""Rooms that ask rather than solve. The library, which is all else, imports nothing of them (test_imports.py). Of each
-both samples have the first test."""
+"""Rooms that ask rather than solve. The library, which is all else, imports nothing of them
+(test_imports.py). Of each both samples have the first test."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
@@ -97,7 +110,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Python looks for garbage less often: it took a tenth of all tests, most of it in what was imported."""
+    """Python looks for garbage less often: it took a tenth of all tests, most of it in what was
+    imported."""
     gc.set_threshold(50_000, 10, 10)
 
 
@@ -114,14 +128,16 @@ def _machine() -> str:
     facts = platform.machine()
     cpus = Path("/proc/cpuinfo")
     if cpus.is_file():
-        facts += "".join(sorted({line for line in cpus.read_text().splitlines() if line.startswith("flags")}))
+        facts += "".join(
+            sorted({line for line in cpus.read_text().splitlines() if line.startswith("flags")})
+        )
     return hashlib.sha256(facts.encode()).hexdigest()[:12]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_programs():
-    """Many modules compile more programs than one process may map, or a small machine holds. Inside a module they stay,
-    as far as they may, so that its tests can count them."""
+    """Many modules compile more programs than one process may map, or a small machine holds. Inside
+    a module they stay, as far as they may, so that its tests can count them."""
     from jaxba.runtime import process  # here, so that the import hook of jaxtyping sees it
 
     share, process.MAPPINGS_SHARE = process.MAPPINGS_SHARE, 0.8
@@ -132,7 +148,8 @@ def few_programs():
 
 @pytest.fixture(scope="session", autouse=True)
 def memory_is_given_back():
-    """Commands that run in this process would set it to keep all memory that it frees, until it had gigabytes."""
+    """Commands that run in this process would set it to keep all memory that it frees, until it had
+    gigabytes."""
     from jaxba.runtime import process
 
     keep, process.keep_memory = process.keep_memory, lambda: False
@@ -142,16 +159,16 @@ def memory_is_given_back():
 
 @pytest.fixture(scope="session", autouse=True)
 def one_blas_thread():
-    """Beside another busy process several threads make a dense factorisation up to two hundred times slower: they wait
-    by spinning."""
+    """Beside another busy process several threads make a dense factorisation up to two hundred
+    times slower: they wait by spinning."""
     with threadpoolctl.threadpool_limits(1, "blas"):
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c():
-    """Ctrl-C has Python's handler, and so the system's in child processes, also where the shell that started pytest
-    ignores it, as `nohup` and many job systems do."""
+    """Ctrl-C has Python's handler, and so the system's in child processes, also where the shell
+    that started pytest ignores it, as `nohup` and many job systems do."""
     ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     if ignored:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -162,7 +179,8 @@ def ctrl_c():
 
 @pytest.fixture
 def unchecked():
-    """Switches the type checks off: what a value of the wrong type does for a user, who has none."""
+    """Switches the type checks off: what a value of the wrong type does for a user, who has
+    none."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,8 +1,9 @@
-"""A street rendered by casting rays: a small KITTI sequence whose poses and geometry are known exactly.
+"""A street rendered by casting rays: a small KITTI sequence whose poses and geometry are known
+exactly.
 
-Four textured planes (ground, two walls, a far wall) stand in KITTI's axes: x right, y down, z forward. No code of
-jaxba takes part, so what is found in the images can be compared with how they were made.
-"""
+Four textured planes (ground, two walls, a far wall) stand in KITTI's axes: x right, y down, z
+forward. No code of jaxba takes part, so what is found in the images can be compared with how they
+were made."""
 
 from __future__ import annotations
 
@@ -46,7 +47,9 @@ def textures() -> list[np.ndarray]:
     layers = []
     for _ in PLANES:
         noise = sum(
-            amount * gaussian_filter(random.standard_normal((1024, 1024)), sigma, mode="wrap") * sigma
+            amount
+            * gaussian_filter(random.standard_normal((1024, 1024)), sigma, mode="wrap")
+            * sigma
             for sigma, amount in ((1.2, 1.0), (4.0, 1.0), (12.0, 0.7))
         )
         layers.append(np.clip(128 + 60 * noise / np.std(noise), 0, 255))
@@ -54,7 +57,8 @@ def textures() -> list[np.ndarray]:
 
 
 def render(camera: Camera, pose: np.ndarray, layers: list[np.ndarray]) -> np.ndarray:
-    """The image seen from a camera-to-world pose [3, 4]: four rays a pixel, the nearest plane in front of each."""
+    """The image seen from a camera-to-world pose [3, 4]: four rays a pixel, the nearest plane in
+    front of each."""
     half = np.array([-0.25, 0.25])
     u = (np.arange(camera.width)[:, None] + half).ravel()
     v = (np.arange(camera.height)[:, None] + half).ravel()
@@ -66,7 +70,9 @@ def render(camera: Camera, pose: np.ndarray, layers: list[np.ndarray]) -> np.nda
             distance = (position - pose[axis, 3]) / rays[..., axis]
         hit = (distance > 0) & (distance < nearest)
         places = pose[:, 3] + rays[hit] * distance[hit][:, None]
-        grey[hit] = map_coordinates(layer, [places[:, a] / TEXEL, places[:, b] / TEXEL], order=1, mode="grid-wrap")
+        grey[hit] = map_coordinates(
+            layer, [places[:, a] / TEXEL, places[:, b] / TEXEL], order=1, mode="grid-wrap"
+        )
         nearest[hit] = distance[hit]
     fine = grey.reshape(camera.height, 2, camera.width, 2)
     return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
@@ -89,7 +95,9 @@ def write_sequence(folder: Path, camera: Camera, poses: np.ndarray) -> Path:
     for number, pose in enumerate(poses):
         cv2.imwrite(str(folder / "image_0" / f"{number:06d}.png"), render(camera, pose, layers))
     matrix = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
-    (folder / "calib.txt").write_text("P0: " + " ".join(f"{number:.12e}" for number in matrix) + "\n")
+    (folder / "calib.txt").write_text(
+        "P0: " + " ".join(f"{number:.12e}" for number in matrix) + "\n"
+    )
     rows = [" ".join(f"{number:.9e}" for number in pose.ravel()) for pose in poses]
     (folder / "poses.txt").write_text("\n".join(rows) + "\n")
     return folder

@@ -1,4 +1,5 @@
-"""Small random problems of every kind: rigs, shared lenses, priors, losses, constants and gauges."""
+"""Small random problems of every kind: rigs, shared lenses, priors, losses, constants and
+gauges."""
 
 from __future__ import annotations
 
@@ -32,12 +33,17 @@ def draw(kind: int, seed: int = 0) -> tuple[BundleProblem, Loss]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProblemWarning)
         problem = _scene(structure, values)
-        problem = _measured(problem, structure, values) if structure.random() < 0.5 else _fixed(problem, structure)
+        problem = (
+            _measured(problem, structure, values)
+            if structure.random() < 0.5
+            else _fixed(problem, structure)
+        )
     return problem, LOSSES[structure.integers(len(LOSSES))]
 
 
 def _scene(structure: np.random.Generator, values: np.random.Generator) -> BundleProblem:
-    """5 to 20 cameras around points, in rigs of up to three sensors, with up to three lenses or one each."""
+    """5 to 20 cameras around points, in rigs of up to three sensors, with up to three lenses or one
+    each."""
     sensors, points = int(structure.integers(1, 4)), int(structure.integers(30, 90))
     frames = int(structure.integers(-(-5 // sensors), 20 // sensors + 1))
     cameras, free = sensors * frames, bool(structure.integers(2))
@@ -45,7 +51,8 @@ def _scene(structure: np.random.Generator, values: np.random.Generator) -> Bundl
     lens = sensor if sensors > 1 else np.arange(cameras) % int(structure.choice([1, 2, cameras]))
     angle = 2 * np.pi * np.arange(frames) / frames * structure.choice([0.3, 1.0])
     upright = np.outer(-angle, [0, 1, 0]) + 0.05 * values.normal(size=(frames, 3))
-    middle = np.array([0, 0, -6.0]) + 0.3 * values.normal(size=(frames, 3))  # of the points, in each frame
+    # of the points, in each frame
+    middle = np.array([0, 0, -6.0]) + 0.3 * values.normal(size=(frames, 3))
     turn, offset = 0.15 * values.normal(size=(sensors, 3)), 0.3 * values.normal(size=(sensors, 3))
     turn[0] = offset[0] = 0
     positions = values.uniform(-1.5, 1.5, size=(points, 3))
@@ -54,10 +61,14 @@ def _scene(structure: np.random.Generator, values: np.random.Generator) -> Bundl
     def placed(upright, middle, turn, offset, lenses) -> tuple[np.ndarray, np.ndarray]:
         place = Rotation.from_rotvec(turn[sensor])
         turns = (place * Rotation.from_rotvec(upright[frame])).as_rotvec()
-        return np.hstack([turns, place.apply(middle[frame]) + offset[sensor], lenses[lens]]), place.as_matrix()
+        return np.hstack(
+            [turns, place.apply(middle[frame]) + offset[sensor], lenses[lens]]
+        ), place.as_matrix()
 
     seen = structure.random((cameras, points)) < 0.7
-    camera, point = np.nonzero(seen | (np.add.outer(np.arange(cameras), np.arange(points)) % cameras < 2))
+    camera, point = np.nonzero(
+        seen | (np.add.outer(np.arange(cameras), np.arange(points)) % cameras < 2)
+    )
     truth = BundleProblem.create(placed(upright, middle, turn, offset, intrinsics)[0], positions,
                                  np.zeros((len(camera), 2)), camera, point)  # fmt: skip
     pixels = geometry.project(truth) + 0.5 * values.normal(size=(len(camera), 2))
@@ -69,17 +80,23 @@ def _scene(structure: np.random.Generator, values: np.random.Generator) -> Bundl
     begun, matrices = placed(*start, turn, offset, numbers)
     rigs = Rigs(frame, matrices, offset[sensor], (sensor > 0) & free) if sensors > 1 else None
     lenses = None if lens.max() + 1 == cameras else Lenses(lens, np.ones((lens.max() + 1, 3), bool))
-    return BundleProblem.create(begun, moved(positions, 0.03), pixels, camera, point, lenses=lenses, rigs=rigs)
+    return BundleProblem.create(
+        begun, moved(positions, 0.03), pixels, camera, point, lenses=lenses, rigs=rigs
+    )
 
 
-def _measured(problem: BundleProblem, structure: np.random.Generator, values: np.random.Generator) -> BundleProblem:
+def _measured(
+    problem: BundleProblem, structure: np.random.Generator, values: np.random.Generator
+) -> BundleProblem:
     """With priors of any strength, and perhaps surveyed points or a scale bar."""
     spread = lambda low, high: float(np.exp(values.uniform(np.log(low), np.log(high))))
     wanted, count = structure.random(5) < [0.7, 0.3, 0.3, 0.3, 0.2], problem.num_cameras
     if wanted[0]:
         sigma = spread(1e-3, 1.0)
         centers = geometry.camera_centers(problem.cameras) + sigma * values.normal(size=(count, 3))
-        problem = with_position_priors(problem, centers, stddev=sigma, align=bool(structure.integers(2)))
+        problem = with_position_priors(
+            problem, centers, stddev=sigma, align=bool(structure.integers(2))
+        )
     if wanted[1]:
         sigma = spread(1e-4, 0.1)
         turns = problem.cameras[:, :3] + 0.3 * sigma * values.normal(size=(count, 3))
@@ -89,12 +106,18 @@ def _measured(problem: BundleProblem, structure: np.random.Generator, values: np
     if wanted[3]:
         sigma, at = spread(1e-3, 0.3), structure.permutation(problem.num_points)[:5]
         surveyed = problem.points[at] + sigma * values.normal(size=(5, 3))
-        rows = residuals.control_point(point=at, position=surveyed, whitening=np.tile(np.eye(3) / sigma, (5, 1, 1)))
+        rows = residuals.control_point(
+            point=at, position=surveyed, whitening=np.tile(np.eye(3) / sigma, (5, 1, 1))
+        )
         problem = with_residual(problem, rows)
     if wanted[4]:
         one, other = structure.permutation(count)[:2]
-        length = np.linalg.norm(np.diff(geometry.camera_centers(problem.cameras)[[one, other]], axis=0))
-        rows = residuals.baseline(pose=[one], pose_2=[other], length=1.05 * length, sigma=spread(1e-3, 0.3))
+        length = np.linalg.norm(
+            np.diff(geometry.camera_centers(problem.cameras)[[one, other]], axis=0)
+        )
+        rows = residuals.baseline(
+            pose=[one], pose_2=[other], length=1.05 * length, sigma=spread(1e-3, 0.3)
+        )
         problem = with_residual(problem, rows)
     return problem
 

@@ -18,7 +18,8 @@ CAMERAS, POINTS = 5, 30
 EACH = np.arange(CAMERAS - 1)  # images and points that have rows
 
 ORIGINS = {"origin": (0.0, 0.0, 0.0), "map": (6e5, 6.6e6, 100.0), "earth": (4e6, 5e5, 4.9e6)}
-"""Where a scene may be: around the origin, in a projected system, around the centre of the earth; metres."""
+"""Where a scene may be: around the origin, in a projected system, around the centre of the earth;
+metres."""
 
 
 def scene(origin: str = "origin", size: float = 1.0, noise: float = 0.5) -> jaxba.BundleProblem:

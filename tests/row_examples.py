@@ -1,4 +1,5 @@
-"""Rows of every residual of `jaxba.residuals`, and of one of a user's own, for problems of one shape."""
+"""Rows of every residual of `jaxba.residuals`, and of one of a user's own, for problems of one
+shape."""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ def rotations(problem: BundleProblem) -> np.ndarray:
 
 
 def views(problem: BundleProblem, rng: np.random.Generator) -> np.ndarray:
-    """Nine observations, of nine points and as many of each camera whatever is drawn: shapes stay the same."""
+    """Nine observations, of nine points and as many of each camera whatever is drawn: shapes stay
+    the same."""
     cameras, points = rng.permutation(CAMERAS)[np.arange(9) % CAMERAS], rng.permutation(POINTS)[:9]
     wanted = cameras * POINTS + points
     order = np.argsort(problem.camera_index * POINTS + problem.point_index)
@@ -72,10 +74,15 @@ def control_point(problem: BundleProblem, rng: np.random.Generator) -> Example:
 
 
 def distance(problem: BundleProblem, rng: np.random.Generator) -> Example:
-    """Two scale bars, which fit as their standard deviations say: a solve moves no whole scene to them."""
+    """Two scale bars, which fit as their standard deviations say: a solve moves no whole scene to
+    them."""
     first, second = rng.permutation(POINTS)[:4].reshape(2, 2)
-    length = np.linalg.norm(problem.points[first] - problem.points[second], axis=1) * rng.uniform(0.9, 1.1, 2)
-    return Example(residuals.distance(point=first, point_2=second, length=length, sigma=0.05 * length), 1)
+    length = np.linalg.norm(problem.points[first] - problem.points[second], axis=1) * rng.uniform(
+        0.9, 1.1, 2
+    )
+    return Example(
+        residuals.distance(point=first, point_2=second, length=length, sigma=0.05 * length), 1
+    )
 
 
 def point_to_plane(problem: BundleProblem, rng: np.random.Generator) -> Example:
@@ -84,14 +91,20 @@ def point_to_plane(problem: BundleProblem, rng: np.random.Generator) -> Example:
     normal = rng.standard_normal((4, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     on_plane = near(rng, problem.points[points], 0.15)
-    return Example(residuals.point_to_plane(point=points, normal=normal, on_plane=on_plane, sigma=0.1), 1)
+    return Example(
+        residuals.point_to_plane(point=points, normal=normal, on_plane=on_plane, sigma=0.1), 1
+    )
 
 
 def baseline(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """Two distances of cameras."""
     first, second = rng.permutation(CAMERAS)[:4].reshape(2, 2)
-    length = np.linalg.norm(centers(problem)[first] - centers(problem)[second], axis=1) * rng.uniform(0.9, 1.1, 2)
-    return Example(residuals.baseline(pose=first, pose_2=second, length=length, sigma=0.05 * length), 1)
+    length = np.linalg.norm(
+        centers(problem)[first] - centers(problem)[second], axis=1
+    ) * rng.uniform(0.9, 1.1, 2)
+    return Example(
+        residuals.baseline(pose=first, pose_2=second, length=length, sigma=0.05 * length), 1
+    )
 
 
 def gravity(problem: BundleProblem, rng: np.random.Generator) -> Example:
@@ -103,9 +116,15 @@ def gravity(problem: BundleProblem, rng: np.random.Generator) -> Example:
 
 def heading(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """Azimuths of three images."""
-    cameras, up, north = rng.permutation(CAMERAS)[:3], rng.standard_normal(3), rng.standard_normal(3)
+    cameras, up, north = (
+        rng.permutation(CAMERAS)[:3],
+        rng.standard_normal(3),
+        rng.standard_normal(3),
+    )
     azimuth = rng.uniform(-3, 3, 3)
-    rows = residuals.heading(pose=cameras, azimuth=azimuth, north=north[None], up=up[None], sigma=3.0)
+    rows = residuals.heading(
+        pose=cameras, azimuth=azimuth, north=north[None], up=up[None], sigma=3.0
+    )
     return Example(rows, 1)
 
 
@@ -114,7 +133,9 @@ def position(problem: BundleProblem, rng: np.random.Generator) -> Example:
     at = near(rng, centers(problem), 0.3)
     lever_arm = 0.1 * rng.standard_normal((CAMERAS, 3))
     whitening = rng.uniform(1, 9, (CAMERAS, 1, 1)) * np.eye(3)
-    rows = residuals.position(pose=np.arange(CAMERAS), position=at, lever_arm=lever_arm, whitening=whitening)
+    rows = residuals.position(
+        pose=np.arange(CAMERAS), position=at, lever_arm=lever_arm, whitening=whitening
+    )
     return Example(rows, 3)
 
 
@@ -148,7 +169,9 @@ def lens_bounds(problem: BundleProblem, rng: np.random.Generator) -> Example:
     low = problem.cameras[:, 6:] - rng.uniform(1, 9, (CAMERAS, 3)) * [1.0, 1e-3, 1e-3]
     high = problem.cameras[:, 6:] + rng.uniform(1, 9, (CAMERAS, 3)) * [1.0, 1e-3, 1e-3]
     sigma = np.array([[0.3, 1e-3, 1e-3]])
-    return Example(residuals.lens_bounds(lens=np.arange(CAMERAS), low=low, high=high, sigma=sigma), 6)
+    return Example(
+        residuals.lens_bounds(lens=np.arange(CAMERAS), low=low, high=high, sigma=sigma), 6
+    )
 
 
 def relative_pose(problem: BundleProblem, rng: np.random.Generator) -> Example:
@@ -156,10 +179,16 @@ def relative_pose(problem: BundleProblem, rng: np.random.Generator) -> Example:
     first, second = rng.permutation(CAMERAS)[:4].reshape(2, 2)
     turns = rotations(problem)
     rotation = turns[first] @ np.swapaxes(turns[second], 1, 2)
-    translation = np.einsum("kij,kj->ki", turns[first], centers(problem)[second] - centers(problem)[first])
+    translation = np.einsum(
+        "kij,kj->ki", turns[first], centers(problem)[second] - centers(problem)[first]
+    )
     whitening = rng.uniform(5, 20, (2, 1, 1)) * np.eye(6)
     rows = residuals.relative_pose(
-        pose=first, pose_2=second, rotation=rotation, translation=near(rng, translation, 0.1), whitening=whitening
+        pose=first,
+        pose_2=second,
+        rotation=rotation,
+        translation=near(rng, translation, 0.1),
+        whitening=whitening,
     )
     return Example(rows, 6)
 
@@ -167,13 +196,24 @@ def relative_pose(problem: BundleProblem, rng: np.random.Generator) -> Example:
 def imu(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """An inertial chain through all images, of any motion."""
     times = np.linspace(0.0, 2.0, 21)
-    rates, forces = 0.1 * rng.standard_normal((21, 3)), near(rng, np.tile([0.0, 0.0, 9.81], (21, 1)), 1.0)
+    rates, forces = (
+        0.1 * rng.standard_normal((21, 3)),
+        near(rng, np.tile([0.0, 0.0, 9.81], (21, 1)), 1.0),
+    )
     moments = np.linspace(0.0, 2.0, CAMERAS)
     data = residuals.preintegrated(times, rates, forces, moments, noise=[0.1, 0.5, 0.1, 0.1])
     mount = np.hstack([np.eye(3), 0.1 * rng.standard_normal((3, 1))])
     one, other = np.arange(CAMERAS - 1), np.arange(1, CAMERAS)
     gravity = np.array([[0.0, 0.0, -9.81]])
-    rows = residuals.imu(pose=one, motion=one, pose_2=other, motion_2=other, gravity=gravity, mount=mount[None], **data)
+    rows = residuals.imu(
+        pose=one,
+        motion=one,
+        pose_2=other,
+        motion_2=other,
+        gravity=gravity,
+        mount=mount[None],
+        **data,
+    )
     return Example(rows, 15, {"motion": 0.1 * rng.standard_normal((CAMERAS, 9))})
 
 
@@ -216,7 +256,8 @@ MAKERS: dict[str, Make] = {
 
 
 def with_rows_of(problem: BundleProblem, names: list[str], seed: int) -> BundleProblem:
-    """The problem with rows of residuals, without the checks of `jaxba.with_residual`, which compiles.
+    """The problem with rows of residuals, without the checks of `jaxba.with_residual`, which
+    compiles.
 
     Args:
         problem: a `scene`.
@@ -228,4 +269,6 @@ def with_rows_of(problem: BundleProblem, names: list[str], seed: int) -> BundleP
         index = tuple(x.astype(np.int32) for x in made.rows.index)
         rows.append(replace(made.rows, size=made.size, index=index, loss=Loss("huber", 3.0)))
         unknowns |= made.unknowns
-    return problem.replace(residuals=Residuals(tuple(rows), tuple(unknowns.values()), names=tuple(unknowns)))
+    return problem.replace(
+        residuals=Residuals(tuple(rows), tuple(unknowns.values()), names=tuple(unknowns))
+    )

@@ -1,8 +1,9 @@
-"""Problems to test on, and the same mathematics once more: dense, in float64, and by other means than jaxba's.
+"""Problems to test on, and the same mathematics once more: dense, in float64, and by other means
+than jaxba's.
 
-Nothing of jaxba's camera, loss or linear algebra is used for the truth: rotations are those of Ceres'
-`AngleAxisRotatePoint`, derivatives come from `jax.jacfwd`, steps from a dense QR factorisation.
-"""
+Nothing of jaxba's camera, loss or linear algebra is used for the truth: rotations are those of
+Ceres' `AngleAxisRotatePoint`, derivatives come from `jax.jacfwd`, steps from a dense QR
+factorisation."""
 
 from __future__ import annotations
 
@@ -56,11 +57,14 @@ def constrained(problem: BundleProblem, *options: Any, **more: Any) -> BundlePro
 def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, iteration=0):
     """`lm_step`, compiled. Called as `solve` does, so that the compilation cache serves both."""
     number = lambda x: jnp.asarray(x, state.cost.dtype)
-    return _step(layout, state, number(damping), options, number(min_gain), jnp.asarray(iteration, jnp.int32))
+    return _step(
+        layout, state, number(damping), options, number(min_gain), jnp.asarray(iteration, jnp.int32)
+    )
 
 
 def solve_options(step: StepOptions | None = None, **asked) -> SolveOptions:
-    """Options of a solve with the given step, by default the one that the policy was made for, in one program.
+    """Options of a solve with the given step, by default the one that the policy was made for, in
+    one program.
 
     Args:
         step: of the solve; its linear system is solved explicitly where nothing else is said.
@@ -75,7 +79,9 @@ def solve_options(step: StepOptions | None = None, **asked) -> SolveOptions:
     return SolveOptions(**{"compilation": "full", **given, **asked})
 
 
-def solve(problem, policy="ceres", options: StepOptions | None = None, *, callback=None, **asked) -> Solution:
+def solve(
+    problem, policy="ceres", options: StepOptions | None = None, *, callback=None, **asked
+) -> Solution:
     """`jaxba.solve` with `solve_options`."""
     return jaxba.solve(problem, policy, solve_options(options, **asked), callback=callback)
 
@@ -90,10 +96,13 @@ def bal_file(name: str) -> Path:
 
 
 def at_origin(problem: BundleProblem, size: float = 1.0) -> BundleProblem:
-    """The problem moved so that the middle of its points is the origin, and their median distance from it `size`."""
+    """The problem moved so that the middle of its points is the origin, and their median distance
+    from it `size`."""
     points = np.asarray(problem.points) - np.median(problem.points, axis=0)
     scale = size / np.median(np.abs(points).sum(axis=1))
-    return transformed(problem, Similarity(scale, np.eye(3), -scale * np.median(problem.points, axis=0)))
+    return transformed(
+        problem, Similarity(scale, np.eye(3), -scale * np.median(problem.points, axis=0))
+    )
 
 
 @functools.cache
@@ -104,17 +113,21 @@ def tiny() -> BundleProblem:
 
 @functools.cache
 def paper(seed: int) -> BundleProblem:
-    """10 cameras, 10 points, all visible: every seed has the same shape, so all share one program."""
+    """10 cameras, 10 points, all visible: every seed has the same shape, so all share one
+    program."""
     return random_scene(scene_like("paper"), seed)
 
 
 @functools.cache
 def whitened() -> BundleProblem:
-    """`tiny` with correlated covariances, and two points whose weights make the clamp of the diagonal act."""
+    """`tiny` with correlated covariances, and two points whose weights make the clamp of the
+    diagonal act."""
     problem = tiny()
     rng = np.random.default_rng(3)
     root = rng.normal(size=(problem.num_observations, 2, 2)) + 1.5 * np.eye(2)
-    problem = BundleProblem.create(*arrays(problem), covariance=root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2))
+    problem = BundleProblem.create(
+        *arrays(problem), covariance=root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    )
     whitening = np.array(problem.whitening)
     whitening[problem.point_index == 4] *= 1e-7
     whitening[problem.point_index == 9] = 0
@@ -123,14 +136,15 @@ def whitened() -> BundleProblem:
 
 @functools.cache
 def odd() -> BundleProblem:
-    """What files contain: a pair seen twice, cameras and points that nobody observes, a point seen once, points
-    behind a camera, and a camera without rotation."""
+    """What files contain: a pair seen twice, cameras and points that nobody observes, a point seen
+    once, points behind a camera, and a camera without rotation."""
     problem = tiny()
     rng = np.random.default_rng(5)
     cameras = np.vstack([problem.cameras, rng.normal(size=(2, 9))])
     middle = problem.points.mean(axis=0)
     points = np.vstack([problem.points, middle + rng.normal(size=(4, 3))])
-    # camera 6 is nobody's, camera 7 looks down -z at the middle from 15 away and has point 41 behind it
+    # camera 6 is nobody's, camera 7 looks down -z at the middle from 15 away and has point 41
+    # behind it
     cameras[7] = [0, 0, 0, *(-middle - [0, 0, 15]), 600, -0.02, 0.001]
     points[41] = middle + np.array([0.4, -0.3, 20.0])
     at = points[[0, 1, 2, 43, 41]] + cameras[7, 3:6]
@@ -161,7 +175,11 @@ def random_views(cameras: int, points: int, seed: int, duplicates: int = 0) -> B
     views = np.concatenate([views, views[rng.integers(len(views), size=duplicates)]])
     pixels = rng.normal(size=(len(views), 2))
     return BundleProblem.create(
-        rng.normal(size=(cameras, 9)), rng.normal(size=(points, 3)), pixels, views[:, 0], views[:, 1]
+        rng.normal(size=(cameras, 9)),
+        rng.normal(size=(points, 3)),
+        pixels,
+        views[:, 0],
+        views[:, 1],
     )
 
 
@@ -189,7 +207,13 @@ def thrown(seed: int, size: float) -> BundleProblem:
 
 def arrays(problem: BundleProblem) -> tuple:
     """The arguments of `BundleProblem.create`."""
-    return problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index
+    return (
+        problem.cameras,
+        problem.points,
+        problem.observations,
+        problem.camera_index,
+        problem.point_index,
+    )
 
 
 def start(problem: BundleProblem, options: StepOptions | None = None, dtype: str = "float64"):
@@ -210,7 +234,9 @@ def same_bits(a, b) -> bool:
     return all(np.asarray(x).tobytes() == np.asarray(y).tobytes() for x, y in pairs)
 
 
-def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp.float64, **changes) -> StepInfo:
+def step_info(
+    accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp.float64, **changes
+) -> StepInfo:
     """A record for a damping rule to look at."""
     number = lambda x: jnp.asarray(x, dtype)
     values = {
@@ -240,7 +266,8 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
 
 
 def rotate(vector, point):
-    """Rotates a point by an angle-axis vector as Ceres' `AngleAxisRotatePoint` does, first order at zero."""
+    """Rotates a point by an angle-axis vector as Ceres' `AngleAxisRotatePoint` does, first order at
+    zero."""
     squared = jnp.sum(vector**2)
     zero = squared < 1e-30
     angle = jnp.sqrt(jnp.where(zero, 1.0, squared))
@@ -272,7 +299,8 @@ def _projected(cameras, points):
 
 
 def distort(plane: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Pixels of image plane coordinates p, [n, 2], under (f, k1, k2), [n, 3]: `f (1 + k1 |p|^2 + k2 |p|^4) p`."""
+    """Pixels of image plane coordinates p, [n, 2], under (f, k1, k2), [n, 3]: `f (1 + k1 |p|^2 + k2
+    |p|^4) p`."""
     square = np.sum(plane**2, axis=1)
     focal, k1, k2 = intrinsics.T
     return (focal * (1 + square * (k1 + square * k2)))[:, None] * plane
@@ -295,7 +323,9 @@ def published_loss(name: str, scale: float, s: np.ndarray) -> tuple[np.ndarray, 
             return b * np.log1p(s / b), 1 / (1 + s / b)
         if name == "tukey":
             inside = s <= b
-            return np.where(inside, b / 3 * (1 - (1 - s / b) ** 3), b / 3), np.where(inside, (1 - s / b) ** 2, 0)
+            return np.where(inside, b / 3 * (1 - (1 - s / b) ** 3), b / 3), np.where(
+                inside, (1 - s / b) ** 2, 0
+            )
     raise AssertionError(name)
 
 
@@ -304,7 +334,8 @@ def published_loss(name: str, scale: float, s: np.ndarray) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Dense:
-    """The damped normal equations of one linearisation as plain matrices; cameras first, then points."""
+    """The damped normal equations of one linearisation as plain matrices; cameras first, then
+    points."""
 
     residual: np.ndarray
     jacobian: np.ndarray
@@ -332,12 +363,15 @@ class Dense:
 def cost(problem: BundleProblem, options: StepOptions) -> float:
     """The objective in float64."""
     residual = _residual(problem)[0]
-    return 0.5 * float(np.sum(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[0]))
+    return 0.5 * float(
+        np.sum(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[0])
+    )
 
 
 def _residual(problem: BundleProblem):
     pixel, *jacobian = _projected(
-        jnp.asarray(problem.cameras)[problem.camera_index], jnp.asarray(problem.points)[problem.point_index]
+        jnp.asarray(problem.cameras)[problem.camera_index],
+        jnp.asarray(problem.points)[problem.point_index],
     )
     residual, jacobian = np.asarray(pixel) - problem.observations, [np.array(j) for j in jacobian]
     if problem.whitening is not None:
@@ -347,11 +381,14 @@ def _residual(problem: BundleProblem):
 
 
 def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals and Jacobian as a vector and a matrix, weighted by the loss; cameras first, then points."""
+    """Residuals and Jacobian as a vector and a matrix, weighted by the loss; cameras first, then
+    points."""
     residual, (turn, camera, point) = _residual(problem)
     if options.coordinates.rotation == "manifold":
         camera[:, :, :3] = turn
-    weight = np.sqrt(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[1])
+    weight = np.sqrt(
+        published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[1]
+    )
     count, cameras = problem.num_observations, problem.num_cameras
     if options.intrinsics == "fixed":
         camera[:, :, 6:] = 0
@@ -360,27 +397,32 @@ def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np
     for k in range(9):
         jacobian[rows, :, 9 * problem.camera_index + k] = weight[:, None] * camera[:, :, k]
     for k in range(3):
-        jacobian[rows, :, 9 * cameras + 3 * problem.point_index + k] = weight[:, None] * point[:, :, k]
+        jacobian[rows, :, 9 * cameras + 3 * problem.point_index + k] = (
+            weight[:, None] * point[:, :, k]
+        )
     return (weight[:, None] * residual).ravel(), jacobian.reshape(2 * count, -1)
 
 
 def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense:
-    """Linearises and solves: the least squares problem `[J; sqrt(D)] d = [-r; 0]` by QR after scaling the columns.
+    """Linearises and solves: the least squares problem `[J; sqrt(D)] d = [-r; 0]` by QR after
+    scaling the columns.
 
-    That is the damped normal equations without squaring the condition number, so that the truth is better than
-    what is compared with it.
-    """
+    That is the damped normal equations without squaring the condition number, so that the truth is
+    better than what is compared with it."""
     residual, jacobian = linear(problem, options)
     diagonal = np.ones(jacobian.shape[1])
     if options.coordinates.scaling == "diagonal":
         diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
     stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
-    free = jacobian.any(axis=0)  # what no residual depends on stays; a factorisation finds that to rounding only
+    # what no residual depends on stays; a factorisation finds that to rounding only
+    free = jacobian.any(axis=0)
     stacked = stacked[:, free]
     scale = 1 / np.linalg.norm(stacked, axis=0)
     q, r = np.linalg.qr(stacked * scale)
     found = np.zeros(len(free))
-    found[free] = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
+    found[free] = scale * solve_triangular(
+        r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))])
+    )
     return Dense(residual, jacobian, diagonal, damping, found)
 
 
@@ -390,11 +432,14 @@ def moved(problem: BundleProblem, options: StepOptions, change: np.ndarray) -> B
     if options.coordinates.rotation == "manifold":
         turn = Rotation.from_rotvec(change[: problem.cameras.size].reshape(-1, 9)[:, :3])
         cameras[:, :3] = (turn * Rotation.from_rotvec(problem.cameras[:, :3])).as_rotvec()
-    return problem.replace(cameras=cameras, points=problem.points + change[problem.cameras.size :].reshape(-1, 3))
+    return problem.replace(
+        cameras=cameras, points=problem.points + change[problem.cameras.size :].reshape(-1, 3)
+    )
 
 
 def back(problem: BundleProblem, before: LMState, after: LMState) -> BundleProblem:
-    """The problem at `after`; which column is which point is told by the start, where all points differ."""
+    """The problem at `after`; which column is which point is told by the start, where all points
+    differ."""
     equal = (np.asarray(before.points).T[:, None, :] == problem.points).all(axis=2)
     assert (equal.sum(axis=1) <= 1).all()
     column, row = np.nonzero(equal)
@@ -408,21 +453,22 @@ def difference(problem: BundleProblem, after: BundleProblem, options: StepOption
     cameras = np.array(after.cameras - problem.cameras)
     if options.coordinates.rotation == "manifold":
         turned = (
-            Rotation.from_rotvec(np.array(after.cameras[:, :3])) * Rotation.from_rotvec(problem.cameras[:, :3]).inv()
+            Rotation.from_rotvec(np.array(after.cameras[:, :3]))
+            * Rotation.from_rotvec(problem.cameras[:, :3]).inv()
         )
         cameras[:, :3] = turned.as_rotvec()
     return np.concatenate([cameras.ravel(), (after.points - problem.points).ravel()])
 
 
 def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> None:
-    """Everything that a step says and does, against the dense solution of the damped normal equations.
+    """Everything that a step says and does, against the dense solution of the damped normal
+    equations.
 
-    Parameters are compared in the norm of the damped Hessian. With seven gauge freedoms its condition number is
-    about 1 / lambda under diagonal scaling and 1e15 for the smallest lambda under identity scaling, so that
-    float64 does not define the gauge part of the step to 1e-8 in any other norm; in this one it always does.
-    Where the condition number allows it, every kind of parameter and the cost behind the step are
-    compared too.
-    """
+    Parameters are compared in the norm of the damped Hessian. With seven gauge freedoms its
+    condition number is about 1 / lambda under diagonal scaling and 1e15 for the smallest lambda
+    under identity scaling, so that float64 does not define the gauge part of the step to 1e-8 in
+    any other norm; in this one it always does. Where the condition number allows it, every kind of
+    parameter and the cost behind the step are compared too."""
     layout, before = start(problem, options)
     after, info = step(layout, before, damping, options)
     truth = dense(problem, options, damping)
@@ -433,7 +479,9 @@ def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     np.testing.assert_allclose(info.previous_cost, now, rtol=1e-12)
     np.testing.assert_allclose(info.predicted, truth.predicted, rtol=1e-8)
     np.testing.assert_allclose(info.gradient_max, np.max(np.abs(truth.gradient)), rtol=1e-10)
-    np.testing.assert_allclose(info.gain_ratio, (now - info.candidate_cost) / truth.predicted, rtol=1e-7)
+    np.testing.assert_allclose(
+        info.gain_ratio, (now - info.candidate_cost) / truth.predicted, rtol=1e-7
+    )
     assert bool(info.accepted) == (info.candidate_cost < now)
     assert float(info.damping) == damping
     if well_conditioned:
@@ -451,13 +499,19 @@ def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
         size = problem.cameras.size
         cameras, expected = found[:size].reshape(-1, 9), truth.step[:size].reshape(-1, 9)
         for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
-            assert np.linalg.norm((cameras - expected)[:, part]) <= 1e-8 * np.linalg.norm(expected[:, part])
-        assert np.linalg.norm(found[size:] - truth.step[size:]) <= 1e-8 * np.linalg.norm(truth.step[size:])
+            assert np.linalg.norm((cameras - expected)[:, part]) <= 1e-8 * np.linalg.norm(
+                expected[:, part]
+            )
+        assert np.linalg.norm(found[size:] - truth.step[size:]) <= 1e-8 * np.linalg.norm(
+            truth.step[size:]
+        )
 
 
 def batch_sums(pairs, chunks: np.ndarray) -> np.ndarray:
     """What a batch after the other sums of its own chunks, all in one row."""
-    return np.concatenate([row[sums].sum(axis=-1) for row, sums in zip(chunks, np.asarray(pairs.sums), strict=True)])
+    return np.concatenate(
+        [row[sums].sum(axis=-1) for row, sums in zip(chunks, np.asarray(pairs.sums), strict=True)]
+    )
 
 
 def by_camera(layout: Layout, values: np.ndarray) -> np.ndarray:
@@ -466,13 +520,18 @@ def by_camera(layout: Layout, values: np.ndarray) -> np.ndarray:
 
 
 def check_sums(layout: Layout, rng: np.random.Generator) -> None:
-    """Sums over points and over cameras equal `np.add.at`, for random values in every slot that is used."""
+    """Sums over points and over cameras equal `np.add.at`, for random values in every slot that is
+    used."""
     values = np.where(layout.slot_mask, rng.normal(size=(4, layout.num_slots)), 0)
     column = np.zeros((4, layout.num_points))
     np.add.at(column.T, layout.slot_point, values.T)
-    np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(
+        point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13
+    )
     apart = jax.jit(point_sums)(layout, list(jnp.asarray(values)))
     np.testing.assert_allclose(jnp.stack(apart), column, rtol=1e-12, atol=1e-13)
     camera = np.zeros((layout.num_cameras, 4))
     np.add.at(camera, layout.slot_camera, values.T)
-    np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(
+        tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13
+    )

@@ -1,4 +1,5 @@
-"""The documents: their code runs, their commands exist, their links lead somewhere, and they stay short."""
+"""The documents: their code runs, their commands exist, their links lead somewhere, and they stay
+short."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from jaxba.solver.names import parse_solver, split_refinement
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
-FENCE = re.compile(r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(
+    r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL
+)
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#[^)]*)?\)")
 FILE = re.compile(r"`((?:jaxba|tests|benchmarks|configs|docs|examples)/[\w/.-]+\.\w+)`")
 COMMAND = re.compile(r"(?:.*/)?jaxba-(\w+)")
@@ -50,10 +53,13 @@ def blocks(page: Path, language: str) -> list[tuple[str, bool]]:
 
 
 def commands(page: Path) -> Iterator[list[str]]:
-    """The calls of jaxba's commands in the shell blocks of a page, and in its text where they have options."""
+    """The calls of jaxba's commands in the shell blocks of a page, and in its text where they have
+    options."""
     lines = [line for code, _ in blocks(page, "sh") for line in code.splitlines()]
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
-    lines += [" ".join(code.split()) for code in re.findall(r"`(jaxba-\w+(?: [^`]*)? --[^`]*)`", text)]
+    lines += [
+        " ".join(code.split()) for code in re.findall(r"`(jaxba-\w+(?: [^`]*)? --[^`]*)`", text)
+    ]
     for line in lines:
         splitter = shlex.shlex(line, posix=True, punctuation_chars=";&|")
         splitter.whitespace_split = True
@@ -73,7 +79,9 @@ def workplace(tmp_path, monkeypatch) -> Path:
     scene = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=30), seed=0)
     jaxba.write_problem(scene, tmp_path / "problem-49-7776-pre.txt.bz2")
     (tmp_path / "runs/mine").mkdir(parents=True)
-    shutil.copy(ROOT / "jaxba/policies/default.safetensors", tmp_path / "runs/mine/policy.safetensors")
+    shutil.copy(
+        ROOT / "jaxba/policies/default.safetensors", tmp_path / "runs/mine/policy.safetensors"
+    )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
     return tmp_path
@@ -86,7 +94,9 @@ SLOW = {"docs/how-to/residuals.md", "docs/reference/api/residuals.md"}
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
+        pytest.param(
+            page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page)
+        )
         for page in PAGES
         if blocks(page, "python")
     ],
@@ -119,7 +129,8 @@ def test_the_commands_of_a_page_have_the_options_that_it_names(page):
             pytest.fail(f"{name_of(page)}: {shlex.join([program, *words])}")
         if solvers := getattr(parsed, "solvers", None):
             for name in solvers.split(","):
-                if not file_of(split_refinement(name)[0]):  # of a file that the page has the reader make
+                # of a file that the page has the reader make
+                if not file_of(split_refinement(name)[0]):
                     parse_solver(name)
 
 
@@ -151,7 +162,9 @@ def test_every_page_is_in_the_navigation_once():
 
 def test_the_page_for_users_of_colmap_names_every_option_that_the_command_understands():
     page = (DOCS / "how-to/from-colmap.md").read_text(encoding="utf-8")
-    assert [name for name in (*colmap_options.OPTIONS, *colmap_options.PATHS) if name not in page] == []
+    assert [
+        name for name in (*colmap_options.OPTIONS, *colmap_options.PATHS) if name not in page
+    ] == []
 
 
 def test_the_readme_is_short():
@@ -159,6 +172,14 @@ def test_the_readme_is_short():
 
 
 def test_documents_that_the_code_names_are_in_the_repository():
-    places = [*ROOT.glob("jaxba/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("configs/**/*.yaml")]
-    named = {(name_of(place), path) for place in places for path in re.findall(r"docs/[\w/-]+\.md", place.read_text())}
+    places = [
+        *ROOT.glob("jaxba/**/*.py"),
+        *ROOT.glob("benchmarks/**/*.py"),
+        *ROOT.glob("configs/**/*.yaml"),
+    ]
+    named = {
+        (name_of(place), path)
+        for place in places
+        for path in re.findall(r"docs/[\w/-]+\.md", place.read_text())
+    }
     assert not [(place, path) for place, path in sorted(named) if not (ROOT / path).exists()]

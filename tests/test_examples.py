@@ -28,9 +28,13 @@ def test_the_notebook_learns_weights_that_bring_held_out_points_nearer_to_the_tr
 def test_a_graph_of_exact_relative_poses_is_solved_and_written(tmp_path):
     random, count = np.random.default_rng(0), 6
     turns, places = Rotation.random(count, rng=0), random.standard_normal((count, 3))
-    start = places + np.where(np.arange(count) > 0, 0.2, 0.0)[:, None] * random.standard_normal((count, 3))
+    start = places + np.where(np.arange(count) > 0, 0.2, 0.0)[:, None] * random.standard_normal(
+        (count, 3)
+    )
     numbers = lambda *parts: " ".join(f"{x:.17g}" for part in parts for x in part)
-    lines = [f"VERTEX_SE3:QUAT {10 * k} {numbers(start[k], turns[k].as_quat())}" for k in range(count)]
+    lines = [
+        f"VERTEX_SE3:QUAT {10 * k} {numbers(start[k], turns[k].as_quat())}" for k in range(count)
+    ]
     information = np.diag([4.0] * 3 + [9.0] * 3)[np.triu_indices(6)]
     for k in range(count):
         other = (k + 1) % count
@@ -40,9 +44,14 @@ def test_a_graph_of_exact_relative_poses_is_solved_and_written(tmp_path):
     (tmp_path / "graph.g2o").write_text("\n".join(lines))
     example = runpy.run_path(str(EXAMPLES / "pose_graph.py"))
     solution = example["main"](str(tmp_path / "graph.g2o"), str(tmp_path / "solved.g2o"))
-    shifted = (start[(np.arange(count) + 1) % count] - start) - (places[(np.arange(count) + 1) % count] - places)
-    assert solution.initial_cost == pytest.approx(0.5 * 4.0 * np.sum(shifted**2))  # nothing is turned
+    shifted = (start[(np.arange(count) + 1) % count] - start) - (
+        places[(np.arange(count) + 1) % count] - places
+    )
+    # nothing is turned
+    assert solution.initial_cost == pytest.approx(0.5 * 4.0 * np.sum(shifted**2))
     assert solution.final_cost < 1e-12
     solved = [line.split() for line in (tmp_path / "solved.g2o").read_text().splitlines()]
-    np.testing.assert_allclose([[float(x) for x in words[2:5]] for words in solved[:count]], places, atol=1e-6)
+    np.testing.assert_allclose(
+        [[float(x) for x in words[2:5]] for words in solved[:count]], places, atol=1e-6
+    )
     assert solved[count:] == [line.split() for line in lines[count:]]

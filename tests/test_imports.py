@@ -1,4 +1,5 @@
-"""Which way imports point: a room of the package knows the rooms below it, and nothing of those above.
+"""Which way imports point: a room of the package knows the rooms below it, and nothing of those
+above.
 
 Imports inside of functions and those for type checkers count as well.
 """
@@ -32,10 +33,21 @@ ORDER = (
         "model",
         "linear",
     ),
-    *("refinement", "lm", "damping", "solver", "results", "constraints", "datasets", "viewer", "jaxba"),
+    *(
+        "refinement",
+        "lm",
+        "damping",
+        "solver",
+        "results",
+        "constraints",
+        "datasets",
+        "viewer",
+        "jaxba",
+    ),
     *("methods", "kitti", "game", "training", "peers", "bench", "paper", "cli"),
 )
-"""Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
+"""Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and
+all before it."""
 
 NO_MORE_THAN = {
     "residuals": {"typing", "runtime", "rotations", "problem"},
@@ -52,16 +64,18 @@ LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti
 """Modules of commands that belong to them."""
 
 DOOR = ("jaxba", "jaxba.training.api")
-"""The one arrow that is not one: `jaxba` names these functions for type checkers, and loads them when they are asked
-for."""
+"""The one arrow that is not one: `jaxba` names these functions for type checkers, and loads them
+when they are asked for."""
 
 MOST_BRANCHES = 115
-"""Most branches on None, and on rigs, of all rooms of the core. It only falls: a feature is a value that knows what it
-is, such as `structure.sharing.Sharing`, so that its users need not ask."""
+"""Most branches on None, and on rigs, of all rooms of the core. It only falls: a feature is a value
+that knows what it is, such as `structure.sharing.Sharing`, so that its users need not ask."""
 
 PACKAGE = Path(jaxba.__file__).parent
 SOURCES = {
-    ".".join(("jaxba", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): path.read_text()
+    ".".join(("jaxba", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(
+        ".__init__"
+    ): path.read_text()
     for path in PACKAGE.rglob("*.py")
 }
 """Source text of every module by its name."""
@@ -111,13 +125,22 @@ def in_laboratory(module: str) -> bool:
 
 def test_the_library_imports_nothing_of_the_laboratory():
     library = {module: source for module, source in SOURCES.items() if not in_laboratory(module)}
-    arrows = [(module, name) for module, source in library.items() for name in imports(source) if in_laboratory(name)]
+    arrows = [
+        (module, name)
+        for module, source in library.items()
+        for name in imports(source)
+        if in_laboratory(name)
+    ]
     assert set(arrows) <= {DOOR}
 
 
 def test_import_jaxba_loads_nothing_of_the_laboratory():
-    program = "import sys, jaxba; print(*(name for name in sys.modules if name.startswith('jaxba.')))"
-    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    program = (
+        "import sys, jaxba; print(*(name for name in sys.modules if name.startswith('jaxba.')))"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert "jaxba.solver.solve" in loaded
     assert [name for name in loaded if in_laboratory(name)] == []
 
@@ -125,7 +148,11 @@ def test_import_jaxba_loads_nothing_of_the_laboratory():
 def test_what_may_be_absent_is_a_value_and_seldom_a_branch():
     branches = re.compile("is None|is not None|in_rigs")
     core = ("structure", "model", "linear", "refinement", "lm", "solver", "results")
-    found = sum(len(branches.findall(source)) for module, source in SOURCES.items() if room_of(module) in core)
+    found = sum(
+        len(branches.findall(source))
+        for module, source in SOURCES.items()
+        if room_of(module) in core
+    )
     assert found <= MOST_BRANCHES
 
 
@@ -150,6 +177,8 @@ def test_a_turned_arrow_is_found(module, source, found):
 
 def test_modules_do_not_import_each_other_in_circles():
     try:
-        TopologicalSorter({module: set(imports(source)) for module, source in SOURCES.items()}).prepare()
+        TopologicalSorter(
+            {module: set(imports(source)) for module, source in SOURCES.items()}
+        ).prepare()
     except CycleError as error:
         pytest.fail(" <- ".join(error.args[1]))

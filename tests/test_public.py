@@ -34,10 +34,16 @@ def test_every_public_name_exists_and_is_documented(name):
         return
     text = inspect.getdoc(found)
     assert text
-    assert not text.startswith(f"{name}("), "only the text that dataclasses and named tuples make up"
+    assert not text.startswith(f"{name}("), (
+        "only the text that dataclasses and named tuples make up"
+    )
     if inspect.isclass(found):
         for member, value in vars(found).items():
-            if inspect.isfunction(value) and not member.startswith("_") and value.__module__.startswith("jaxba"):
+            if (
+                inspect.isfunction(value)
+                and not member.startswith("_")
+                and value.__module__.startswith("jaxba")
+            ):
                 assert inspect.getdoc(value), f"{name}.{member}"
 
 
@@ -50,7 +56,9 @@ def documented_constants(module) -> set[str]:
         if isinstance(statement, ast.Assign | ast.AnnAssign)
         and isinstance(after, ast.Expr)
         and isinstance(after.value, ast.Constant)
-        for target in (statement.targets if isinstance(statement, ast.Assign) else [statement.target])
+        for target in (
+            statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+        )
         if isinstance(target, ast.Name)
     }
 
@@ -72,20 +80,28 @@ def test_the_reference_describes_every_public_name_and_no_other():
 def test_no_public_function_hides_a_module():
     modules = {module.name for module in pkgutil.iter_modules(jaxba.__path__)}
     assert not {name for name in modules if inspect.isfunction(getattr(jaxba, name, None))}
-    # where no room has the name of a function, and every other module stands in a room, there is none to hide
+    # where no room has the name of a function, and every other module stands in a room, there is
+    # none to hide
     alone = {"__init__.py", "rotations.py", "typing.py", "py.typed"}
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == alone
 
 
-NEED_VISER = {f"jaxba.viewer.{name}" for name in ("curve", "extra", "layers", "page", "page_file", "stage", "words")}
+NEED_VISER = {
+    f"jaxba.viewer.{name}"
+    for name in ("curve", "extra", "layers", "page", "page_file", "stage", "words")
+}
 
 
 @pytest.mark.extra
-@pytest.mark.parametrize("module", [m.name for m in pkgutil.walk_packages(jaxba.__path__, "jaxba.")])
+@pytest.mark.parametrize(
+    "module", [m.name for m in pkgutil.walk_packages(jaxba.__path__, "jaxba.")]
+)
 def test_every_module_can_be_imported_and_says_what_it_is_for(module):
     missing = [name for name in ("pyceres", "pycolmap") if importlib.util.find_spec(name) is None]
     if module.startswith("jaxba.peers.") and missing:  # then it says in one line what it needs
-        with pytest.raises(ImportError, match=r"this needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
+        with pytest.raises(
+            ImportError, match=r"this needs pyceres and pycolmap: pip install jaxba\[ceres\]"
+        ):
             importlib.import_module(module)
         return
     if module in NEED_VISER and importlib.util.find_spec("viser") is None:
@@ -155,7 +171,18 @@ def test_help_starts_no_backend():
 
 UNNEEDED = (
     "jaxba.methods",
-    *("flax", "optax", "orbax", "matplotlib", "PIL", "yaml", "rich", "pycolmap", "pyceres", "scipy.linalg"),
+    *(
+        "flax",
+        "optax",
+        "orbax",
+        "matplotlib",
+        "PIL",
+        "yaml",
+        "rich",
+        "pycolmap",
+        "pyceres",
+        "scipy.linalg",
+    ),
     *(
         "scipy.sparse",
         "scipy.optimize",
@@ -165,10 +192,16 @@ UNNEEDED = (
         "jaxba.game",
         "jaxba.training",
     ),
-    *("jaxba.training", "jaxba.paper", "jaxba.peers.ceres", "jaxba.structure.louvain", "jaxba.kitti"),
+    *(
+        "jaxba.training",
+        "jaxba.paper",
+        "jaxba.peers.ceres",
+        "jaxba.structure.louvain",
+        "jaxba.kitti",
+    ),
 )
-"""Modules that a solve of a BAL file with the default options does without. Together they would take longer to import
-than many a problem takes to solve."""
+"""Modules that a solve of a BAL file with the default options does without. Together they would
+take longer to import than many a problem takes to solve."""
 
 
 def test_the_command_loads_nothing_that_a_solve_does_not_need(tmp_path):
@@ -177,7 +210,8 @@ def test_the_command_loads_nothing_that_a_solve_does_not_need(tmp_path):
     jaxba.write_bal(scene, tmp_path / "problem.txt")
     code = (
         "import sys, jaxba.cli.solve\n"
-        f"assert jaxba.cli.solve.run([{str(tmp_path / 'problem.txt')!r}, '--max-iterations', '1']) == 0\n"
+        f"assert jaxba.cli.solve.run([{str(tmp_path / 'problem.txt')!r}, '--max-iterations', '1']) "
+        "== 0\n"
         f"print('loaded:', *sorted(set(sys.modules) & set({UNNEEDED!r})))\n"
         "import numpy as np, scipy.linalg\n"  # the whole of it can still be imported
         "assert scipy.linalg.cholesky(np.eye(2))[0, 0] == 1\n"

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from jaxba.rotations import angle_axis, rotation_matrix
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-14, 1e-8, 1e-3, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-8, np.pi - 1e-12, np.pi])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-14, 1e-8, 1e-3, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-8, np.pi - 1e-12, np.pi]
+)
 def test_angle_axis_vectors_are_those_of_scipy(angle):
     axes = np.random.default_rng(0).normal(size=(30, 3))
     axes = np.vstack([axes, np.eye(3), -np.eye(3)])

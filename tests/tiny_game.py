@@ -1,4 +1,5 @@
-"""A game small enough to compile in seconds, shared by the tests of the environment and of its Gymnasium adapter."""
+"""A game small enough to compile in seconds, shared by the tests of the environment and of its
+Gymnasium adapter."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ RULES = GameConfig(agent=AGENT, max_iterations=4)
 def tiny_bank() -> Bank:
     """A dozen scenes or more, with the best costs that Ceres' and GTSAM's rules find."""
     key = jax.random.key(5)
-    return select(*solve_scenes(KIND, make_scenes(KIND, key, 120), StepOptions(), 40, rules=("ceres",)))
+    return select(
+        *solve_scenes(KIND, make_scenes(KIND, key, 120), StepOptions(), 40, rules=("ceres",))
+    )
 
 
 def tiny_game(config: GameConfig = RULES, envs: int = 6) -> Game:

@@ -1,4 +1,5 @@
-"""Games small enough to solve by hand: one `Environment` whose rules are numbers, compiled once for all of them."""
+"""Games small enough to solve by hand: one `Environment` whose rules are numbers, compiled once for
+all of them."""
 
 from __future__ import annotations
 
@@ -89,10 +90,14 @@ class Toy:
         clock = state.clock + 1
         ended = clock >= self.length
         best = self.best + self.follow * state.sign
-        reward = self.constant + self.slope * state.sign - self.curvature * (action[:, 0] - best) ** 2
+        reward = (
+            self.constant + self.slope * state.sign - self.curvature * (action[:, 0] - best) ** 2
+        )
         reward = jnp.where(self.only_last & ~ended, 0.0, reward)
         final = self._see(state.sign, clock)
-        after = ToyState(jnp.where(ended, self._deal(deal), state.sign), jnp.where(ended, 0, clock), key)
+        after = ToyState(
+            jnp.where(ended, self._deal(deal), state.sign), jnp.where(ended, 0, clock), key
+        )
         observation = self._see(after.sign, after.clock)
         final = jnp.where(self.forgets, observation, final)
         broken = self.breaks & (jnp.arange(self.num_envs) % 2 == 1)
@@ -123,11 +128,11 @@ BOTH = Toy(slope=1.0, curvature=1.0, follow=0.5)
 """Q(s, a) = s - (a - s / 2)^2."""
 
 HIDDEN = Toy(slope=1.0, curvature=1.0, follow=0.5, hides=True)
-"""As `BOTH` for a policy that does not see the sign: its best action is zero, and Q(s, 0) = s - 1 / 4."""
+"""As `BOTH` for a policy that does not see the sign: its best action is zero, and Q(s, 0) = s - 1 /
+4."""
 
 ENDLESS = Toy(slope=1.0, length=2, truncates=True)
 """Every second step cuts off what would go on for ever: Q(s) = s / (1 - gamma).
 
-Where those steps led to a random sign instead (the observation after the reset) or to nothing (taken for terminal), it
-would be s / (1 - gamma / 2).
-"""
+Where those steps led to a random sign instead (the observation after the reset) or to nothing
+(taken for terminal), it would be s / (1 - gamma / 2). """

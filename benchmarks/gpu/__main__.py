@@ -1,7 +1,8 @@
-"""An LM step on a GPU: phases, floating point types, several devices, throughput of small scenes and of training,
-memory.
+"""An LM step on a GPU: phases, floating point types, several devices, throughput of small scenes
+and of training, memory.
 
-    python -m benchmarks.gpu [--problems scene:ladybug-1197,...] [--out benchmarks/gpu/results.json] [--any-device]
+    python -m benchmarks.gpu [--problems scene:ladybug-1197,...] [--out benchmarks/gpu/results.json]
+    [--any-device]
 
 Without a GPU it prints a message and measures nothing, unless `--any-device` is given.
 """
@@ -41,11 +42,15 @@ ENVIRONMENTS = (64, 512, 4096)
 
 
 def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, Any]]:
-    """Seconds per iteration of complete solves, for each floating point type, without and with point iterations."""
+    """Seconds per iteration of complete solves, for each floating point type, without and with
+    point iterations."""
     for dtype in ("float64", "mixed", "float32"):
         for refine in (0, 3):
             options = SolveOptions(
-                refinement=Refinement(points=refine), dtype=dtype, max_iterations=iterations, compilation="full"
+                refinement=Refinement(points=refine),
+                dtype=dtype,
+                max_iterations=iterations,
+                compilation="full",
             )
             run = lambda options=options: jaxba.solve(problem, "ceres", options)
             first, second = run(), run()
@@ -62,21 +67,32 @@ def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, A
 
 
 def divided(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, Any]]:
-    """Seconds per iteration with points divided among 1, 2, 4, ... of the devices, by the implicit solver."""
+    """Seconds per iteration with points divided among 1, 2, 4, ... of the devices, by the implicit
+    solver."""
     count = 1
     while count <= len(jax.devices()):
         options = SolveOptions(
-            linear_solver="implicit", devices=count, max_iterations=iterations, compilation="full", pad=False
+            linear_solver="implicit",
+            devices=count,
+            max_iterations=iterations,
+            compilation="full",
+            pad=False,
         )
         jaxba.solve(problem, "ceres", options)
         found = jaxba.solve(problem, "ceres", options)
         seconds = found.total_s / found.iterations
-        yield {"devices": count, "seconds_per_iteration": seconds, "cost": found.final_cost, "setup_s": found.setup_s}
+        yield {
+            "devices": count,
+            "seconds_per_iteration": seconds,
+            "cost": found.final_cost,
+            "setup_s": found.setup_s,
+        }
         count *= 2
 
 
 def training_throughput(envs: int) -> dict[str, float]:
-    """Environment steps and gradient updates per second of SAC's compiled loop on so many pendulums."""
+    """Environment steps and gradient updates per second of SAC's compiled loop on so many
+    pendulums."""
     measure = sac.ours(SacConfig(), envs, 512)
     samples = [measure() for _ in range(3)]
     updates = statistics.median(sample.updates / sample.wall_s for sample in samples)
@@ -86,9 +102,13 @@ def training_throughput(envs: int) -> dict[str, float]:
 def scene_throughput(count: int, dtype: Any) -> float:
     """LM steps per second on `count` scenes of 10 cameras and 10 points in one program."""
     options = StepOptions()
-    problems = [jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(min(count, 256))]
+    problems = [
+        jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(min(count, 256))
+    ]
     layouts = [jaxba.build_layout(problem) for problem in problems]
-    states = [jaxba.initial_state(la, p, options, dtype) for la, p in zip(layouts, problems, strict=True)]
+    states = [
+        jaxba.initial_state(la, p, options, dtype) for la, p in zip(layouts, problems, strict=True)
+    ]
     tile = lambda x: jnp.tile(x, (-(-count // len(problems)),) + (1,) * (x.ndim - 1))[:count]
     stack = lambda trees: jax.tree.map(lambda *leaves: tile(jnp.stack(leaves)), *trees)
     step = lambda la, s, d: jaxba.lm_step(la, s, d, options)
@@ -111,24 +131,37 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--iterations", type=int, default=10)
     parser.add_argument("--out", default="")
-    parser.add_argument("--any-device", action="store_true", help="run on the default device of JAX")
+    parser.add_argument(
+        "--any-device", action="store_true", help="run on the default device of JAX"
+    )
     args = parser.parse_args()
     device = jax.devices()[0]
     if device.platform != "gpu" and not args.any_device:
         print(f"no GPU: JAX has only {device.device_kind!r}; nothing was measured", file=sys.stderr)
         return 3
     jax.config.update("jax_enable_x64", True)
-    results: dict[str, Any] = {"device": device.device_kind, "jax": jax.__version__, "problems": {}, "scenes": {}}
+    results: dict[str, Any] = {
+        "device": device.device_kind,
+        "jax": jax.__version__,
+        "problems": {},
+        "scenes": {},
+    }
     rate = bandwidth()
     results["copy_bytes_per_s"] = rate
     print(f"{device.device_kind}, copy bandwidth {rate / 1e9:.0f} GB/s")
     for source in sources(args.problems.split(",")):
         problem = source.read()
-        print(f"\n{source.name}: {problem.num_cameras} cameras, {problem.num_observations} observations\n{HEADING}")
+        print(
+            f"\n{source.name}: {problem.num_cameras} cameras, {problem.num_observations} "
+            f"observations\n{HEADING}"
+        )
         options = StepOptions(linear_solver=choose(problem), refinement=Refinement(points=3))
         started = time.perf_counter()
         layout = jax.device_put(build_layout(problem, options))
-        entry: dict[str, Any] = {"solver": options.linear_solver, "layout_s": time.perf_counter() - started}
+        entry: dict[str, Any] = {
+            "solver": options.linear_solver,
+            "layout_s": time.perf_counter() - started,
+        }
         entry["phases"] = []
         for phase in measure(layout, problem, options, rate, args.repeats):
             print(phase, flush=True)

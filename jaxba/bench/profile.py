@@ -1,11 +1,12 @@
 """Time and iterations to a tolerance, and performance profiles. Pure functions of records.
 
-Costs are accepted costs in pixels squared. Times are seconds without compilation. Iterations are linear solves,
-accepted or rejected. A target that is never reached has infinite time and iterations. Repeats are combined by their
-median, so that a solver that fails in at least half of its repeats counts as failed.
+Costs are accepted costs in pixels squared. Times are seconds without compilation. Iterations are
+linear solves, accepted or rejected. A target that is never reached has infinite time and
+iterations. Repeats are combined by their median, so that a solver that fails in at least half of
+its repeats counts as failed.
 
-Source: performance profiles of rootba (Demmel et al. 2021, after Dolan and Moré 2002), with one change: problems that
-no solver finishes stay in the denominator."""
+Source: performance profiles of rootba (Demmel et al. 2021, after Dolan and Moré 2002), with one
+change: problems that no solver finishes stay in the denominator."""
 
 from __future__ import annotations
 
@@ -20,29 +21,47 @@ import numpy as np
 from jaxba.game.statistics import Reached
 from jaxba.solver.record import Record
 
-ITERATION_LIMIT = 100  # a solve that has not converged within this many iterations is a failure. Source: the paper
-PAPER_TOLERANCES = (0.1, 0.001)  # values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures
+# a solve that has not converged within this many iterations is a failure. Source: the paper
+ITERATION_LIMIT = 100
+# values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures
+PAPER_TOLERANCES = (0.1, 0.001)
 RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)  # values of epsilon in the target `f <= f*(1 + epsilon)`
-ZERO_RESIDUAL_FLOOR = 1e-12  # costs to f* plus this times f0 are within every tolerance, as f* may be rounding (1e-26)
-INITIAL_COST_TOLERANCE = 1e-2  # relative difference of costs above which two solvers started elsewhere. Source: rootba
+# costs to f* plus this times f0 are within every tolerance, as f* may be rounding (1e-26)
+ZERO_RESIDUAL_FLOOR = 1e-12
+# relative difference of costs above which two solvers started elsewhere. Source: rootba
+INITIAL_COST_TOLERANCE = 1e-2
 
 COST_DEFINITION_TOLERANCE = 1e-5
-"""Relative difference of initial costs above which rounding cannot be the reason. float32 makes about 1e-6; ignoring
-the 31 observations of Ladybug-49 whose points are behind their cameras, as COLMAP does, makes 1.3e-4."""
+"""Relative difference of initial costs above which rounding cannot be the reason. float32 makes
+about 1e-6; ignoring the 31 observations of Ladybug-49 whose points are behind their cameras, as
+COLMAP does, makes 1.3e-4."""
 
 CONVERGED = frozenset(
-    {"cost", "step", "gradient", "rounding", "within", "converged", "convergence", "ftol", "xtol", "gtol"}
+    {
+        "cost",
+        "step",
+        "gradient",
+        "rounding",
+        "within",
+        "converged",
+        "convergence",
+        "ftol",
+        "xtol",
+        "gtol",
+    }
 )
-"""Values of `Record.termination`, in lower case, that mean converged; the first five are those of `Termination`."""
+"""Values of `Record.termination`, in lower case, that mean converged; the first five are those of
+`Termination`."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A cost threshold, or convergence, at which the time and iterations of a solve are measured."""
+    """A cost threshold, or convergence, at which the time and iterations of a solve are
+    measured."""
 
     kind: Literal["tau", "relative", "converged"]
-    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon). `converged`: the end of a solve
-    that converged within `ITERATION_LIMIT` iterations."""
+    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon).
+    `converged`: the end of a solve that converged within `ITERATION_LIMIT` iterations."""
 
     value: float = 0.0
     """tau or epsilon; unused for `converged`."""
@@ -66,7 +85,8 @@ def taus(tolerance: float) -> list[float]:
 
 
 def cost_targets(tolerance: float) -> tuple[Target, ...]:
-    """Costs relative to the best one: the paper's values of tau and the given one, and the relative tolerances."""
+    """Costs relative to the best one: the paper's values of tau and the given one, and the relative
+    tolerances."""
     relative = (Target("relative", epsilon) for epsilon in RELATIVE_TOLERANCES)
     return (*(Target("tau", tau) for tau in taus(tolerance)), *relative)
 
@@ -94,13 +114,17 @@ def solver_names(records: Iterable[Record]) -> list[str]:
 
 def initial_costs(records: Iterable[Record]) -> dict[str, float]:
     """f0 of each problem: the largest finite initial cost of its records, NaN if there is none."""
-    starts = {name: filter(math.isfinite, (r.initial_cost for r in runs)) for name, runs in by_problem(records).items()}
+    starts = {
+        name: filter(math.isfinite, (r.initial_cost for r in runs))
+        for name, runs in by_problem(records).items()
+    }
     return {name: max(costs, default=math.nan) for name, costs in starts.items()}
 
 
 def best_cost(records: Iterable[Record]) -> dict[str, float]:
-    """f* of each problem: the lowest accepted cost of any solver, converged or not, NaN if none is finite. Of float32
-    solvers only the initial and final costs count, which were computed in float64."""
+    """f* of each problem: the lowest accepted cost of any solver, converged or not, NaN if none is
+    finite. Of float32 solvers only the initial and final costs count, which were computed in
+    float64."""
     found = {}
     for name, runs in by_problem(records).items():
         costs = [cost for r in runs for cost in (r.initial_cost, lowest_cost(r))]
@@ -109,7 +133,8 @@ def best_cost(records: Iterable[Record]) -> dict[str, float]:
 
 
 def lowest_cost(record: Record) -> float:
-    """The lowest finite accepted cost of a run, or NaN. A float32 run's trace is ignored for its rounding errors."""
+    """The lowest finite accepted cost of a run, or NaN. A float32 run's trace is ignored for its
+    rounding errors."""
     trace = [] if record.dtype == "float32" else [point.cost for point in record.trace]
     return min(filter(math.isfinite, (record.final_cost, *trace)), default=math.nan)
 
@@ -139,7 +164,8 @@ def _reach(iterations: int, seconds: float) -> Reached:
 
 
 def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
-    """Iterations and time of one solve to a target, given the problem's initial cost f0 and best cost f*."""
+    """Iterations and time of one solve to a target, given the problem's initial cost f0 and best
+    cost f*."""
     if target.kind == "converged":
         end = record.trace[-1].time_s if record.trace else record.total_s
         return _reach(record.iterations, end) if converged(record) else NEVER
@@ -148,34 +174,45 @@ def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
 
 
 def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str, Reached]]:
-    """Iterations and time to a target, `table[solver][problem]`, medians over repeats, without pairs not run."""
+    """Iterations and time to a target, `table[solver][problem]`, medians over repeats, without
+    pairs not run."""
     starts, bests = initial_costs(records), best_cost(records)
     found: dict[str, dict[str, list[Reached]]] = {}
     for r in records:
         item = reach(r, target, starts[r.problem], bests[r.problem])
         found.setdefault(r.solver, {}).setdefault(r.problem, []).append(item)
-    median = lambda items: Reached(*(float(statistics.median(values)) for values in zip(*items, strict=True)))
-    return {solver: {name: median(items) for name, items in row.items()} for solver, row in found.items()}
+    median = lambda items: Reached(
+        *(float(statistics.median(values)) for values in zip(*items, strict=True))
+    )
+    return {
+        solver: {name: median(items) for name, items in row.items()}
+        for solver, row in found.items()
+    }
 
 
 def reached(row: Mapping[str, Reached], names: Sequence[str]) -> Reached:
-    """A row of `reach_table` as arrays over problems; a problem that was not run counts as not reached."""
+    """A row of `reach_table` as arrays over problems; a problem that was not run counts as not
+    reached."""
     found = [row.get(name, NEVER) for name in names]
     return Reached(np.array([r.iterations for r in found]), np.array([r.seconds for r in found]))
 
 
 Curve: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
-"""Performance profile of a solver: the fraction of all problems solved within alpha times the fastest solver's time, a
-step function of alpha. Positions of the steps, ascending from 1, and the value from each position on, in [0, 1]."""
+"""Performance profile of a solver: the fraction of all problems solved within alpha times the
+fastest solver's time, a step function of alpha. Positions of the steps, ascending from 1, and the
+value from each position on, in [0, 1]."""
 
 
 def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, Curve]:
-    """Performance profile of each solver. `times[solver][problem]` is a time or another positive cost; infinite, NaN or
-    absent means not solved. The denominator is the number of problems that have an entry for any solver, solved or not.
-    If the best time of a problem is 0 (solved at the start), only times of 0 count as within any factor."""
+    """Performance profile of each solver. `times[solver][problem]` is a time or another positive
+    cost; infinite, NaN or absent means not solved. The denominator is the number of problems that
+    have an entry for any solver, solved or not. If the best time of a problem is 0 (solved at the
+    start), only times of 0 count as within any factor."""
     names = list(dict.fromkeys(name for row in times.values() for name in row))
     best = {
-        name: min((row[name] for row in times.values() if row.get(name, math.nan) >= 0), default=math.inf)
+        name: min(
+            (row[name] for row in times.values() if row.get(name, math.nan) >= 0), default=math.inf
+        )
         for name in names
     }
     curves = {}
@@ -196,7 +233,8 @@ def _ratio(time: float, best: float) -> float:
 
 
 def cost_warnings(records: Sequence[Record]) -> list[str]:
-    """A warning for each problem on which initial costs of solvers differ: they minimised different functions."""
+    """A warning for each problem on which initial costs of solvers differ: they minimised different
+    functions."""
     lines = []
     for name, runs in by_problem(records).items():
         costs = {r.solver: r.initial_cost for r in runs if math.isfinite(r.initial_cost)}
@@ -206,9 +244,14 @@ def cost_warnings(records: Sequence[Record]) -> list[str]:
         low, high = min(costs, key=costs.__getitem__), max(costs, key=costs.__getitem__)
         gap = (costs[high] - costs[low]) / max(abs(costs[high]), abs(costs[low]), 1e-300)
         if gap > COST_DEFINITION_TOLERANCE:
-            reason = "they did not start alike" if gap > INITIAL_COST_TOLERANCE else "more than rounding explains"
+            reason = (
+                "they did not start alike"
+                if gap > INITIAL_COST_TOLERANCE
+                else "more than rounding explains"
+            )
             lines.append(
-                f"{name}: initial costs differ by {100 * gap:.2g} % ({low} {costs[low]:.7g}, {high} {costs[high]:.7g}),"
+                f"{name}: initial costs differ by {100 * gap:.2g} % ({low} {costs[low]:.7g}, "
+                f"{high} {costs[high]:.7g}),"
                 f" {reason}; comparisons on it mislead"
             )
     return lines

@@ -1,4 +1,5 @@
-"""Runs solvers on problems and appends a record of each run to a results file, so that a run can be continued."""
+"""Runs solvers on problems and appends a record of each run to a results file, so that a run can be
+continued."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ from jaxba.solver.solve import Solution, solve
 from jaxba.typing import InputError
 
 RESULTS = "results.jsonl"  # file of the records, one line per run
-SETTINGS = "settings.json"  # file of the settings that all runs in a folder share; other settings are refused there
+# file of the settings that all runs in a folder share; other settings are refused there
+SETTINGS = "settings.json"
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class RunSettings:
 
     max_iterations: int = MAX_ITERATIONS  # limit of linear solves
     linear_solver: str = "auto"  # of the method `lm`; others have their own
-    pad: bool = False  # whether problems are padded, so that those of one capacity share compiled programs
+    # whether problems are padded, so that those of one capacity share compiled programs
+    pad: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,28 +59,41 @@ class Job:
 def run_solver(
     problem: BundleProblem, source: Source, solver: SolverName, repeat: int, settings: RunSettings
 ) -> Record:
-    """Solves one problem once, with a Python callback after each iteration, and so with measured times. The name and
-    family of the source and the number of the repeat, from 0, go into the record."""
+    """Solves one problem once, with a Python callback after each iteration, and so with measured
+    times. The name and family of the source and the number of the repeat, from 0, go into the
+    record."""
     steps: list[IterationRecord] = []
     watch = lambda step: steps.append(step)
     limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances()}
     if solver.peer:
-        solution, backend = _solve_by_peer(problem, solver, callback=watch, threads=threads(), **limits)
+        solution, backend = _solve_by_peer(
+            problem, solver, callback=watch, threads=threads(), **limits
+        )
     else:
         policy, options = solver.build()
         linear_solver = settings.linear_solver if solver.method == DEFAULT_METHOD else "auto"
-        options = replace(options, linear_solver=linear_solver, pad=settings.pad, compilation="full", **limits)
+        options = replace(
+            options, linear_solver=linear_solver, pad=settings.pad, compilation="full", **limits
+        )
         solution, backend = solve(problem, policy, options, callback=watch), ""
-    record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
+    record = record_of(
+        solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat
+    )
     if solver.peer:
         record = replace(record, backend=backend, device="cpu: host")
-    if solver.dtype == "float32":  # rounding errors of its own sums are larger than the differences between solvers
-        record = replace(record, initial_cost=geometry.cost(problem), final_cost=geometry.cost(solution.problem))
+    # rounding errors of its own sums are larger than the differences between solvers
+    if solver.dtype == "float32":
+        record = replace(
+            record, initial_cost=geometry.cost(problem), final_cost=geometry.cost(solution.problem)
+        )
     return record
 
 
-def _solve_by_peer(problem: BundleProblem, solver: SolverName, **options: Any) -> tuple[Solution, str]:
-    """The solution by another library, which computes on the host, and what the library is called."""
+def _solve_by_peer(
+    problem: BundleProblem, solver: SolverName, **options: Any
+) -> tuple[Solution, str]:
+    """The solution by another library, which computes on the host, and what the library is
+    called."""
     from jaxba.peers.ceres import solve_by_ceres
     from jaxba.peers.colmap import backend
 
@@ -98,8 +114,9 @@ def machine() -> dict[str, str]:
 
 
 def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> list[Job]:
-    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once. Raises
-    InputError: an unknown solver, one whose type its method does not have, or one whose library is not installed."""
+    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count
+    once. Raises InputError: an unknown solver, one whose type its method does not have, or one
+    whose library is not installed."""
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
     parsed = [parse_solver(name) for name in names]
     for solver in parsed:
@@ -110,13 +127,21 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
                 options.step_options(policy)
             except ValueError as error:
                 raise InputError(f"{error} (in {str(solver)!r})") from None
-    return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
+    return [
+        Job(source, solver, repeat)
+        for source in sources
+        for solver in parsed
+        for repeat in range(repeats)
+    ]
 
 
-def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job], command: str = "") -> list[Record]:
-    """Creates the folder, or continues a benchmark in it. Writes the settings and the command. Returns the records that
-    the folder already has, one for each run. Raises ProblemError: the folder has runs with other settings, or
-    results of other problems or policies (by checksum) under the same names."""
+def open_folder(
+    folder: Path, settings: RunSettings, jobs: Sequence[Job], command: str = ""
+) -> list[Record]:
+    """Creates the folder, or continues a benchmark in it. Writes the settings and the command.
+    Returns the records that the folder already has, one for each run. Raises ProblemError: the
+    folder has runs with other settings, or results of other problems or policies (by checksum)
+    under the same names."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
@@ -124,22 +149,43 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job], comman
     paths |= {job.solver.policy: file for job in jobs if (file := file_of(job.solver.policy))}
     files = {name: digest for name, file in paths.items() if (digest := _digest(Path(file)))}
     names = {source.name: source.location for source in sources}
-    current: dict[str, Any] = {"command": command, **asdict(settings), "problems": names, "files": files}
+    current: dict[str, Any] = {
+        "command": command,
+        **asdict(settings),
+        "problems": names,
+        "files": files,
+    }
     done = _results(folder / RESULTS)
     solved = {record.problem for record in done}
-    used = lambda name: name in solved or (file_of(name) and any(name in record.solver for record in done))
+    used = lambda name: (
+        name in solved or (file_of(name) and any(name in record.solver for record in done))
+    )
     if path.exists():
         try:
             previous = json.loads(path.read_text())
             known = dict(previous.pop("problems"))
             known_files = dict(previous.pop("files", {}))  # absent in folders of older versions
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
-        changed = [key for key, value in asdict(settings).items() if previous.get(key, value) != value]
-        changed += [name for name, file in current["problems"].items() if used(name) and known.get(name, file) != file]
-        changed += [name for name, digest in files.items() if used(name) and known_files.get(name, digest) != digest]
+            raise ProblemError(
+                f"{path}: not the settings of a benchmark ({type(error).__name__})"
+            ) from None
+        changed = [
+            key for key, value in asdict(settings).items() if previous.get(key, value) != value
+        ]
+        changed += [
+            name
+            for name, file in current["problems"].items()
+            if used(name) and known.get(name, file) != file
+        ]
+        changed += [
+            name
+            for name, digest in files.items()
+            if used(name) and known_files.get(name, digest) != digest
+        ]
         if changed:
-            raise ProblemError(f"{folder} holds a run with another {changed[0]}; give another --out, or remove it")
+            raise ProblemError(
+                f"{folder} holds a run with another {changed[0]}; give another --out, or remove it"
+            )
         current["problems"] = {**known, **current["problems"]}
         current["files"] = {**known_files, **files}
     write_text(path, json.dumps(current, indent=1) + "\n")
@@ -149,12 +195,14 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job], comman
 def _results(path: Path) -> list[Record]:
     first: dict[tuple[str, str, int], Record] = {}
     for record in json_lines.read(path, Record) if path.exists() else []:
-        first.setdefault((record.problem, record.solver, record.repeat), record)  # a run may have been done twice
+        # a run may have been done twice
+        first.setdefault((record.problem, record.solver, record.repeat), record)
     return list(first.values())
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a COLMAP model. Empty if one cannot be read: later reading reports it."""
+    """SHA-256 of a file, or of all files of a COLMAP model. Empty if one cannot be read: later
+    reading reports it."""
     total = hashlib.sha256()
     try:
         for part in visible(path) if path.is_dir() else [path]:
@@ -176,11 +224,13 @@ def execute(
     *,
     strict: bool = False,
 ) -> Iterator[Record]:
-    """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
+    """Runs the jobs that have no record yet. Appends each record to the results file, then yields
+    it.
 
-    A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or runs out of memory
-    on it, is reported and skipped for this problem. `done` are records of earlier runs; `on_error` is called for what
-    is skipped, with `strict` also problems that would lose a part. Raises OSError: a result cannot be written."""
+    A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or
+    runs out of memory on it, is reported and skipped for this problem. `done` are records of
+    earlier runs; `on_error` is called for what is skipped, with `strict` also problems that would
+    lose a part. Raises OSError: a result cannot be written."""
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()
     for job in jobs:

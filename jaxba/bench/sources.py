@@ -1,4 +1,5 @@
-"""Problems of a benchmark by name or path: files, COLMAP models, downloaded BAL problems and random scenes."""
+"""Problems of a benchmark by name or path: files, COLMAP models, downloaded BAL problems and random
+scenes."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from jaxba.problem.facing import set_aside, without_views_of
 from jaxba.scenes import DEFAULT_SCENES, random_scene, scene_like
 
 SCENE_PREFIX = "scene:"  # prefix of a random scene: `scene:NAME` or `scene:NAME:SEED`
-_GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)  # folder names that do not identify a COLMAP model
+# folder names that do not identify a COLMAP model
+_GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,12 @@ class Source:
     name: str  # unique within a benchmark
     family: str  # name of the folder of a file; `scene` for a random scene
     location: str  # path, or `scene:NAME:SEED`
-    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)  # where its location does not say how
+    # where its location does not say how
+    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)
 
     def read(self, *, strict: bool = False) -> BundleProblem:
-        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: one line."""
+        """Reads or generates the problem; `strict` as for `read_problem`. Raises ProblemError: one
+        line."""
         if self.make is not None:
             return self.make()
         if not self.location.startswith(SCENE_PREFIX):
@@ -40,9 +44,10 @@ class Source:
 
 
 def sources(locations: list[str]) -> list[Source]:
-    """Checks that problems exist, and gives each a unique name. Locations are paths, random scenes (`scene:NAME:SEED`),
-    or names of downloaded BAL problems such as ladybug-49, if there is no file of that name; duplicates count once.
-    Raises ProblemError: a missing file or an unknown scene; the message is one line."""
+    """Checks that problems exist, and gives each a unique name. Locations are paths, random scenes
+    (`scene:NAME:SEED`), or names of downloaded BAL problems such as ladybug-49, if there is no file
+    of that name; duplicates count once. Raises ProblemError: a missing file or an unknown scene;
+    the message is one line."""
     found: list[Source] = []
     place = lambda one: one if one.startswith(SCENE_PREFIX) else Path(one).resolve()
     for location in locations:
@@ -56,7 +61,8 @@ def sources(locations: list[str]) -> list[Source]:
             path = Path(location)
             if not path.is_file() and not holds_problem(path):
                 raise ProblemError(
-                    f"{location}: {'a directory without a COLMAP model' if path.is_dir() else 'no such file'}"
+                    f"{location}: "
+                    f"{'a directory without a COLMAP model' if path.is_dir() else 'no such file'}"
                 )
             label = Path(strip_compression(name)).name
             label = (Path(label).stem if by_ending(label) else label) or path.name
@@ -78,9 +84,13 @@ def sources(locations: list[str]) -> list[Source]:
 
 
 def _model_name(folder: Path) -> str:
-    """Name of a COLMAP model: that of its folder, after those above up to one not generic: `garden-sparse-0`."""
+    """Name of a COLMAP model: that of its folder, after those above up to one not generic:
+    `garden-sparse-0`."""
     parts = list(folder.resolve().parts[1:]) or ["model"]
-    count = next((k for k, part in enumerate(reversed(parts), 1) if not _GENERIC_FOLDER.fullmatch(part)), len(parts))
+    count = next(
+        (k for k, part in enumerate(reversed(parts), 1) if not _GENERIC_FOLDER.fullmatch(part)),
+        len(parts),
+    )
     return "-".join(parts[-count:])
 
 

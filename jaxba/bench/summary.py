@@ -1,8 +1,9 @@
 """Statistics of records, for each solver and for each pair of problem and solver.
 
-A mean over the problems on which a target was reached is always given with the number k of these problems, out of all n
-problems of the benchmark. Iterations also have a capped mean over all n problems, in which a target that was not
-reached counts as `ITERATION_LIMIT`, so that a solver cannot improve its mean by failing on hard problems."""
+A mean over the problems on which a target was reached is always given with the number k of these
+problems, out of all n problems of the benchmark. Iterations also have a capped mean over all n
+problems, in which a target that was not reached counts as `ITERATION_LIMIT`, so that a solver
+cannot improve its mean by failing on hard problems."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class Cell(NamedTuple):
     converged: bool  # more than half of the repeats within `ITERATION_LIMIT` iterations
     termination: str  # distinct reasons of the repeats to stop, joined by a slash
     final_cost: float  # pixels squared; infinite if not finite
-    final_ratio: float  # (final cost + floor) / (f* + floor), floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best
+    # (final cost + floor) / (f* + floor), floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best
+    final_ratio: float
     iterations: float
     rejected: float
     seconds: float  # solve time without compilation
@@ -38,10 +40,11 @@ class Cell(NamedTuple):
 
 
 class TargetSummary(NamedTuple):
-    """Statistics of a solver on one target over all problems, `total`, also those that it was not run on.
+    """Statistics of a solver on one target over all problems, `total`, also those that it was not
+    run on.
 
-    Means are geometric: over the reached problems, with a count of 0 taken as 1, NaN if there are none; of
-    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`."""
+    Means are geometric: over the reached problems, with a count of 0 taken as 1, NaN if there are
+    none; of `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`."""
 
     reached: int
     total: int
@@ -62,7 +65,8 @@ class SolverSummary(NamedTuple):
 
 
 class ProblemSummary(NamedTuple):
-    """Size of a problem, its initial and best cost (pixels squared), and the first solver that reached that."""
+    """Size of a problem, its initial and best cost (pixels squared), and the first solver that
+    reached that."""
 
     problem: str
     family: str
@@ -86,13 +90,16 @@ class Summary:
 
 
 def summarize(records: Sequence[Record], tolerance: float = 1e-3) -> Summary:
-    """Computes the statistics of all tables, from any number of records, also none. `tolerance` is tau of the target
-    `tau`."""
+    """Computes the statistics of all tables, from any number of records, also none. `tolerance` is
+    tau of the target `tau`."""
     targets = (*profile.cost_targets(tolerance), Target("converged"))
     starts, bests = profile.initial_costs(records), profile.best_cost(records)
     tables = {target.key: profile.reach_table(records, target) for target in targets}
     names, solvers = profile.problem_names(records), profile.solver_names(records)
-    found = {key: {s: profile.reached(table.get(s, {}), names) for s in solvers} for key, table in tables.items()}
+    found = {
+        key: {s: profile.reached(table.get(s, {}), names) for s in solvers}
+        for key, table in tables.items()
+    }
     cells = []
     for name in names:
         for solver in solvers:
@@ -105,10 +112,14 @@ def summarize(records: Sequence[Record], tolerance: float = 1e-3) -> Summary:
     warning = "{} was run on {} of {} problems; the others count as not reached"
     return Summary(
         targets=targets,
-        problems=[_problem(runs, starts[name], bests[name]) for name, runs in profile.by_problem(records).items()],
+        problems=[
+            _problem(runs, starts[name], bests[name])
+            for name, runs in profile.by_problem(records).items()
+        ],
         solvers=[_solver(solver, cells, found, len(names)) for solver in solvers],
         cells=cells,
-        warnings=profile.cost_warnings(records) + [warning.format(*one, len(names)) for one in few.items()],
+        warnings=profile.cost_warnings(records)
+        + [warning.format(*one, len(names)) for one in few.items()],
     )
 
 
@@ -118,7 +129,9 @@ def _median(values: Iterable[float]) -> float:
 
 
 def _cell(runs: Sequence[Record], reaches: dict[str, Reached], f0: float, f_star: float) -> Cell:
-    final = statistics.median(r.final_cost if math.isfinite(r.final_cost) else math.inf for r in runs)
+    final = statistics.median(
+        r.final_cost if math.isfinite(r.final_cost) else math.inf for r in runs
+    )
     floor = profile.ZERO_RESIDUAL_FLOOR * f0
     return Cell(
         problem=runs[0].problem,
@@ -127,7 +140,11 @@ def _cell(runs: Sequence[Record], reaches: dict[str, Reached], f0: float, f_star
         converged=math.isfinite(reaches["converged"].iterations),
         termination="/".join(dict.fromkeys(r.termination for r in runs)),
         final_cost=final,
-        final_ratio=(final + floor) / (f_star + floor) if f_star + floor > 0 else 1.0 if final <= 0 else math.inf,
+        final_ratio=(final + floor) / (f_star + floor)
+        if f_star + floor > 0
+        else 1.0
+        if final <= 0
+        else math.inf,
         iterations=_median(float(r.iterations) for r in runs),
         rejected=_median(float(r.iterations - r.accepted) for r in runs),
         seconds=_median(r.trace[-1].time_s if r.trace else r.total_s for r in runs),

@@ -41,7 +41,13 @@ def percentage(fraction: float) -> str:
 
 def compact(summary: Summary) -> Table:
     """What is worth knowing of every solver, in 100 columns."""
-    header = ("solver", "iterations\nto 0.1 %", "seconds\nto 0.1 %", "reached", "iterations\nto the end")
+    header = (
+        "solver",
+        "iterations\nto 0.1 %",
+        "seconds\nto 0.1 %",
+        "reached",
+        "iterations\nto the end",
+    )
     rows = []
     for s in summary.solvers:
         near, end = s.targets["relative_0.001"], s.targets["converged"]
@@ -50,11 +56,15 @@ def compact(summary: Summary) -> Table:
         ends = counts[1], number(s.final_ratio_worst, 5), f"{s.compile_s:.1f}"
         rows.append((s.solver, *means[:2], counts[0], means[2], *ends))
     note = (
-        "0.1 %: above the best cost that any solver reached. Geometric means over problems; a failure counts as "
-        f"{profile.ITERATION_LIMIT} iterations, and not in the seconds. A program that several solvers or problems "
+        "0.1 %: above the best cost that any solver reached. Geometric means over problems; a "
+        "failure counts as "
+        f"{profile.ITERATION_LIMIT} iterations, and not in the seconds. A program that several "
+        "solvers or problems "
         "share is compiled for the first one."
     )
-    return Table("Solvers", (*header, "converged", "worst end\n/ best", "seconds of\ncompiling"), rows, note)
+    return Table(
+        "Solvers", (*header, "converged", "worst end\n/ best", "seconds of\ncompiling"), rows, note
+    )
 
 
 def reach_tables(summary: Summary) -> list[Table]:
@@ -66,12 +76,16 @@ def reach_tables(summary: Summary) -> list[Table]:
         cells = [by_key[target.key] for target in targets]
         reached = [f"{cell.reached}/{cell.total}" for cell in cells]
         capped = [
-            f"{number(c.iterations)} [{number(c.iterations_capped)}] {k}" for c, k in zip(cells, reached, strict=True)
+            f"{number(c.iterations)} [{number(c.iterations_capped)}] {k}"
+            for c, k in zip(cells, reached, strict=True)
         ]
         iterations.append((name, *capped))
-        seconds.append((name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
+        seconds.append(
+            (name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True)))
+        )
     note = (
-        "Geometric mean over the problems reached, k of n (k/n). f*: lowest accepted cost of any solver; "
+        "Geometric mean over the problems reached, k of n (k/n). f*: lowest accepted cost of any "
+        "solver; "
         "τ: f* + τ(f0 - f*)."
     )
     capped_note = f" In brackets: over all n, with {profile.ITERATION_LIMIT} for those not reached."
@@ -83,7 +97,15 @@ def reach_tables(summary: Summary) -> list[Table]:
 
 def details(summary: Summary) -> Table:
     """A row for each pair of problem and solver."""
-    header = ("problem", "solver", "its to f*(1+0.001)", "converged", "rejected", "final cost", "final / best")
+    header = (
+        "problem",
+        "solver",
+        "its to f*(1+0.001)",
+        "converged",
+        "rejected",
+        "final cost",
+        "final / best",
+    )
     rows = []
     for c in summary.cells:
         reaches = [c.reach[key] for key in ("relative_0.001", "converged")]
@@ -91,8 +113,17 @@ def details(summary: Summary) -> Table:
         ends = [number(c.final_cost, 7), number(c.final_ratio, 6)]
         times = [number(reaches[0].seconds), number(c.seconds)]
         rows.append((c.problem, c.solver, *counts, *ends, *times, c.termination))
-    note = "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that of the whole solve."
-    return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
+    note = (
+        "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that "
+        "of the whole solve."
+    )
+    return Table(
+        "Problems",
+        (*header, "s to f*(1+0.001)", "time s", "termination"),
+        rows,
+        note,
+        text_columns=2,
+    )
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -119,7 +150,9 @@ def to_rich(table: Table) -> RichTable:
         padding=(0, 1, 0, 0),
     )
     for i, name in enumerate(table.header):
-        drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
+        drawn.add_column(
+            Text(name), justify="left" if i < table.text_columns else "right", overflow="fold"
+        )
     for row in table.rows:
         drawn.add_row(*(Text(cell) for cell in row))
     return drawn

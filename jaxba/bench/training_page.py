@@ -14,11 +14,13 @@ from jaxba.game.rollout import Trajectories
 from jaxba.solver.figure import COLOURS
 from jaxba.training.log import Row
 
-AXES = ("updates", "seconds")  # positions of the switch: gradient updates of an agent, seconds of training
+# positions of the switch: gradient updates of an agent, seconds of training
+AXES = ("updates", "seconds")
 TRAINED = "trained"  # name of the trained policy in charts
 
 HELD_OUT = {"mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
-"""Charts of held-out scores: fields of a `Score` and their titles. The log has `mean` as `score`."""
+"""Charts of held-out scores: fields of a `Score` and their titles. The log has `mean` as
+`score`."""
 
 EPISODES = 6  # scenes whose episodes are shown
 
@@ -39,27 +41,44 @@ RULE = Style(COLOURS[-1], "8px,6px", "circle")  # of Ceres' rule, where it is no
 
 
 def to_html(
-    rows: Sequence[Row], rules: Mapping[str, Any], table: Table, episodes: Trajectories, facts: Mapping[str, str]
+    rows: Sequence[Row],
+    rules: Mapping[str, Any],
+    table: Table,
+    episodes: Trajectories,
+    facts: Mapping[str, str],
 ) -> str:
-    """The page: from rows of the log, a `Score` by name of the yardstick, the comparison on the held-out scenes,
-    episodes of the best policy, of which the first `EPISODES` are shown, and machine, versions and command."""
+    """The page: from rows of the log, a `Score` by name of the yardstick, the comparison on the
+    held-out scenes, episodes of the best policy, of which the first `EPISODES` are shown, and
+    machine, versions and command."""
     styles = solver_styles([TRAINED, *rules])
     agents = len({row["seed"] for row in rows})
-    spread = f"Mean of {agents} agents; shaded: from the lowest to the highest. " if agents > 1 else ""
+    spread = (
+        f"Mean of {agents} agents; shaded: from the lowest to the highest. " if agents > 1 else ""
+    )
     whole = page.Page("jaxba training", facts, styles, AXES)
     held_out = [_held_out(rows, rules, styles, field) for field in HELD_OUT]
-    whole.add("On held-out scenes", page.note(f"{spread}Level: yardsticks."), whole.charts(held_out))
+    whole.add(
+        "On held-out scenes", page.note(f"{spread}Level: yardsticks."), whole.charts(held_out)
+    )
     whole.add_table(table)
     logged = [name for name in LEARNING if name in rows[0]]
     learning = {name: _curve(rows, name, styles[TRAINED]) for name in logged}
     if learning:
         ceres = "Ceres' rule on these scenes"
-        learning[logged[0]] += _curve(rows, "episode/ceres", styles.get("ceres", RULE), name="ceres", label=ceres)
-    whole.add("Learning", page.note(spread), whole.charts([_over(LEARNING[x], learning[x]) for x in logged]))
+        learning[logged[0]] += _curve(
+            rows, "episode/ceres", styles.get("ceres", RULE), name="ceres", label=ceres
+        )
+    whole.add(
+        "Learning",
+        page.note(spread),
+        whole.charts([_over(LEARNING[x], learning[x]) for x in logged]),
+    )
     whole.add(
         f"The best policy on {min(EPISODES, len(episodes.iterations))} held-out scenes",
         page.note("Every line is a scene. Hollow: the step was rejected."),
-        whole.charts([_episodes("damping λ", episodes, 1), _episodes("cost (pixels²)", episodes, 0)]),
+        whole.charts(
+            [_episodes("damping λ", episodes, 1), _episodes("cost (pixels²)", episodes, 0)]
+        ),
     )
     return whole.to_html()
 
@@ -69,35 +88,63 @@ def _over(title: str, traces: Sequence[Chart]) -> Chart:
     return chart(title, traces, x, axis("", zero=True), height=320)
 
 
-def _held_out(rows: Sequence[Row], rules: Mapping[str, Any], styles: Mapping[str, Style], field: str) -> Chart:
+def _held_out(
+    rows: Sequence[Row], rules: Mapping[str, Any], styles: Mapping[str, Style], field: str
+) -> Chart:
     """A held-out score over training, and the levels of the yardsticks."""
     scale = 100.0 if field == "failures" else 1.0
-    traces = _curve(rows, f"held_out/{'score' if field == 'mean' else field}", styles[TRAINED], scale)
+    traces = _curve(
+        rows, f"held_out/{'score' if field == 'mean' else field}", styles[TRAINED], scale
+    )
     ends = {name: [traces[-1]["x"][name][k] for k in (0, -1)] for name in AXES} if traces else {}
-    level = lambda name, one: line(name, ends, [scale * getattr(one, field)] * 2, styles[name], marked=False)
-    return _over(HELD_OUT[field], [*traces, *(level(name, one) for name, one in rules.items() if traces)])
+    level = lambda name, one: line(
+        name, ends, [scale * getattr(one, field)] * 2, styles[name], marked=False
+    )
+    return _over(
+        HELD_OUT[field], [*traces, *(level(name, one) for name, one in rules.items() if traces)]
+    )
 
 
 def _curve(
-    rows: Sequence[Row], metric: str, style: Style, scale: float = 1.0, name: str = TRAINED, label: str = ""
+    rows: Sequence[Row],
+    metric: str,
+    style: Style,
+    scale: float = 1.0,
+    name: str = TRAINED,
+    label: str = "",
 ) -> list[Chart]:
-    """The mean of a metric over agents, by chunk. Of several agents that are `TRAINED`, also the range and each one."""
+    """The mean of a metric over agents, by chunk. Of several agents that are `TRAINED`, also the
+    range and each one."""
     chunks: dict[int, tuple[Row, list[float]]] = {}
     for row in rows:
         if row.get(metric) is not None:
             chunks.setdefault(row["chunk"], (row, []))[1].append(scale * row[metric])
     found = [chunks[chunk] for chunk in sorted(chunks)]
-    x = {"updates": [row["updates"] for row, _ in found], "seconds": [row["wall_s"] for row, _ in found]}
+    x = {
+        "updates": [row["updates"] for row, _ in found],
+        "seconds": [row["wall_s"] for row, _ in found],
+    }
     values = [agents for _, agents in found]
     most = max(map(len, values), default=0)
-    mean = line(name, x, [sum(ys) / len(ys) for ys in values], style, label=label, marked=name == TRAINED)
+    mean = line(
+        name, x, [sum(ys) / len(ys) for ys in values], style, label=label, marked=name == TRAINED
+    )
     if name != TRAINED or most < 2:
         return [mean] if found or name != TRAINED else []
     shade = "rgba({}, {}, {}, 0.18)".format(*(int(style.color[k : k + 2], 16) for k in (1, 3, 5)))
-    edge = {"meta": TRAINED, "x": x, "mode": "lines", "line": {"width": 0, "color": style.color}, "hoverinfo": "skip"}
+    edge = {
+        "meta": TRAINED,
+        "x": x,
+        "mode": "lines",
+        "line": {"width": 0, "color": style.color},
+        "hoverinfo": "skip",
+    }
     low, high = ({**edge, "y": [end(ys) for ys in values]} for end in (min, max))
     of = lambda k: [ys[k] if k < len(ys) else float("nan") for ys in values]
-    single = [line(TRAINED, x, of(k), style, label=f"agent {k + 1}", marked=False, opacity=0.5) for k in range(most)]
+    single = [
+        line(TRAINED, x, of(k), style, label=f"agent {k + 1}", marked=False, opacity=0.5)
+        for k in range(most)
+    ]
     single = [{**one, "line": {**one["line"], "width": 0.7}} for one in single]
     return [low, {**high, "fill": "tonexty", "fillcolor": shade}, mean, *single]
 
@@ -111,4 +158,6 @@ def _episodes(title: str, episodes: Trajectories, start: int) -> Chart:
         numbers = values[k, : count + 1 - start].tolist()
         one = line(f"scene {k + 1}", list(range(start, count + 1)), numbers, style)
         traces.append(hollow(one, [False] * (1 - start) + rejected.tolist()))
-    return chart(title, traces, {name: axis("iteration") for name in AXES}, axis("", log=True), height=320)
+    return chart(
+        title, traces, {name: axis("iteration") for name in AXES}, axis("", log=True), height=320
+    )

@@ -19,7 +19,8 @@ from jaxba.cli.options import options
 from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "ceres,ceres+refine3,guarded,classic"
-"""Ceres' rule, without and with embedded point iterations, the default policy, and the paper's rule."""
+"""Ceres' rule, without and with embedded point iterations, the default policy, and the paper's
+rule."""
 
 WIDTH = 100  # width of the table in characters
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)  # A variable that `os.path.expandvars` expands
@@ -30,17 +31,22 @@ class Arguments:
     """Options of `jaxba-bench`."""
 
     problems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Files, downloaded BAL problems such as ladybug-49 (see jaxba-data), or random scenes such as scene:ladybug-49 or
-    scene:tiny:7. Default: the problems of the suite, or six random scenes, padded to one shape."""
+    """Files, downloaded BAL problems such as ladybug-49 (see jaxba-data), or random scenes such as
+    scene:ladybug-49 or scene:tiny:7. Default: the problems of the suite, or six random scenes,
+    padded to one shape."""
 
     suite: str | None = None
-    """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems (names or paths, in
-    which wildcards and $VARIABLES are expanded), solvers, tolerance, repeats, max_iterations."""
+    """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems
+    (names or paths, in which wildcards and $VARIABLES are expanded), solvers, tolerance, repeats,
+    max_iterations."""
 
-    solvers: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_SOLVERS})")] = None
-    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], where a policy may be a class of
-    your own, mine.py:Tenfold; or, with the extra `ceres`, pyceres:dense|sparse|iterative|dense-inner|sparse-inner.
-    Default: Ceres' rule without and with embedded iterations, the default policy, and the paper's rule."""
+    solvers: Annotated[
+        str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_SOLVERS})")
+    ] = None
+    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], where a policy
+    may be a class of your own, mine.py:Tenfold; or, with the extra `ceres`,
+    pyceres:dense|sparse|iterative|dense-inner|sparse-inner. Default: Ceres' rule without and with
+    embedded iterations, the default policy, and the paper's rule."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""
@@ -58,8 +64,8 @@ class Arguments:
     """Fail instead of skipping invalid parts of the input."""
 
     out: str = "runs/bench"
-    """Folder of the results. A second run with the same folder does only what is missing; one with other settings needs
-    another folder."""
+    """Folder of the results. A second run with the same folder does only what is missing; one with
+    other settings needs another folder."""
 
 
 def main() -> None:
@@ -68,10 +74,13 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 if all runs are done, 2 for bad input, 130 after Ctrl-C (results are kept)."""
+    """Runs the command. Exit status: 0 if all runs are done, 2 for bad input, 130 after Ctrl-C
+    (results are kept)."""
     command = common.command_line("jaxba-bench", argv)
     bench = functools.partial(_bench, command=command)
-    return common.run_command(Arguments, bench, "Compares solvers: tables, performance profiles, plots.", argv)
+    return common.run_command(
+        Arguments, bench, "Compares solvers: tables, performance profiles, plots.", argv
+    )
 
 
 def _bench(args: Arguments, command: str) -> int:
@@ -114,7 +123,8 @@ def _check_apart(folder: Path, args: Arguments, jobs: Any) -> None:
 def _run_missing(
     folder: Path, done: Any, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str
 ) -> int:
-    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError: it cannot."""
+    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError: it
+    cannot."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -130,7 +140,10 @@ def _run_missing(
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
-        console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", soft_wrap=True)
+        console.print(
+            f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}",
+            soft_wrap=True,
+        )
     status = 0
 
     def fail(error: Exception) -> None:
@@ -139,7 +152,12 @@ def _run_missing(
         common.print_error(str(error))
 
     say = functools.partial(console.print, soft_wrap=True)
-    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
     try:
         with common.notes_printed(say), bar:
@@ -166,12 +184,16 @@ def _line(problem: str, records: Any) -> str:
     seconds = sum(one.setup_s + one.compile_s + one.total_s for one in records)
     compiled, cost = sum(one.compile_s for one in records), min(one.final_cost for one in records)
     runs = common.counted(len(records), "run")
-    return f"{problem}: {runs} in {seconds:.1f} s ({compiled:.1f} s of compilation), least cost {cost:.8g}"
+    return (
+        f"{problem}: {runs} in {seconds:.1f} s ({compiled:.1f} s of compilation), least cost "
+        f"{cost:.8g}"
+    )
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Content of a suite file; the command line replaces what it gives, by the options of the same names."""
+    """Content of a suite file; the command line replaces what it gives, by the options of the same
+    names."""
 
     problems: tuple[str, ...] = ()  # names or paths, in which $VARIABLES and wildcards are expanded
     solvers: tuple[str, ...] | None = None  # names of solvers
@@ -197,14 +219,21 @@ def _with_suite(args: Arguments) -> Arguments:
         suite = settings.read(Suite, data)
     except configurations.SettingsError as error:
         raise common.UsageError(f"--suite {args.suite}: {error}") from None
-    problems = args.problems or tuple(path for entry in suite.problems for path in _expand(args, entry))
+    problems = args.problems or tuple(
+        path for entry in suite.problems for path in _expand(args, entry)
+    )
     solvers = args.solvers or (None if suite.solvers is None else ",".join(suite.solvers))
-    rest = {k: getattr(suite, k) for k in ("tolerance", "repeats", "max_iterations") if getattr(args, k) is None}
+    rest = {
+        k: getattr(suite, k)
+        for k in ("tolerance", "repeats", "max_iterations")
+        if getattr(args, k) is None
+    }
     return replace(args, problems=problems, solvers=solvers, **rest)
 
 
 def _expand(args: Arguments, entry: str) -> list[str]:
-    """The names or paths for an entry of a suite's problems, with variables and wildcards expanded."""
+    """The names or paths for an entry of a suite's problems, with variables and wildcards
+    expanded."""
     for name in _VARIABLE.findall(entry):
         unset = f"{entry}: the environment variable {name}, a folder of problems, is not set"
         common.require(bool(os.environ.get(name)), f"--suite {args.suite}: {unset}")

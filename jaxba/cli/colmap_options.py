@@ -40,19 +40,32 @@ OPTIONS: dict[str, str | dict[str, list[str]]] = {
     "loss_function_scale": "--loss-scale",
     "min_track_length": {"0": [], "1": []},
 }
-"""Options of COLMAP's bundle adjustment by name: the option of the same meaning, or arguments for each value."""
+"""Options of COLMAP's bundle adjustment by name: the option of the same meaning, or arguments for
+each value."""
 
 MACHINE = (
-    *("backend", "use_gpu", "gpu_index", "num_threads", "auto_select_solver_type", "max_linear_solver_iterations"),
+    *(
+        "backend",
+        "use_gpu",
+        "gpu_index",
+        "num_threads",
+        "auto_select_solver_type",
+        "max_linear_solver_iterations",
+    ),
     *("min_num_images_gpu_solver", "min_num_residuals_for_cpu_multi_threading"),
-    *(f"max_num_images_direct_{kind}_{where}_solver" for kind in ("dense", "sparse") for where in ("cpu", "gpu")),
+    *(
+        f"max_num_images_direct_{kind}_{where}_solver"
+        for kind in ("dense", "sparse")
+        for where in ("cpu", "gpu")
+    ),
 )
 """Those that say how and where Ceres solves its linear systems: accepted, and of no effect."""
 
 
 def translated(argv: Sequence[str]) -> list[str]:
-    """A command line with COLMAP's options replaced. All constants are gathered in one `--constant`. Raises UsageError:
-    an option of COLMAP that has no meaning here, or no value; one line."""
+    """A command line with COLMAP's options replaced. All constants are gathered in one
+    `--constant`. Raises UsageError: an option of COLMAP that has no meaning here, or no value; one
+    line."""
     found, paths, constants, words = [], [], [], list(argv)
     while words:
         word = words.pop(0)
@@ -66,7 +79,11 @@ def translated(argv: Sequence[str]) -> list[str]:
             if not equals and not words:
                 raise UsageError(f"{name} needs a value")
             arguments = _arguments(name, value if equals else words.pop(0))
-            whole = {"--input_path": paths, "--constant": constants}.get(arguments[0]) if arguments else None
+            whole = (
+                {"--input_path": paths, "--constant": constants}.get(arguments[0])
+                if arguments
+                else None
+            )
             if whole is None:
                 found += arguments
             else:

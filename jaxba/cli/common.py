@@ -1,4 +1,5 @@
-"""Code shared by the commands: errors of one line, output, the compilation cache, checks of arguments."""
+"""Code shared by the commands: errors of one line, output, the compilation cache, checks of
+arguments."""
 
 from __future__ import annotations
 
@@ -21,13 +22,16 @@ from jaxba.runtime.interrupt import ENDED, INTERRUPTED, Interrupt
 from jaxba.typing import InputError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
+"""Errors of a disk that is full or may not be written: no fault of the program, wherever they come
+up."""
 
 MISFIT = 3
-"""Exit status of `jaxba-solve --strict` where a solution was written, and what was measured does not fit it."""
+"""Exit status of `jaxba-solve --strict` where a solution was written, and what was measured does
+not fit it."""
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
-"""Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
+"""Write bits of a file mode; they are checked separately, since `os.access` allows root to write
+without them."""
 
 
 class UsageError(InputError):
@@ -41,11 +45,13 @@ def run_command(
     argv: Sequence[str] | None,
     subcommand: str = "",
 ) -> int:
-    """Parses the command line and runs `main`. Expected errors, and signals that `main` does not handle, are one line
-    on stderr. Returns the exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
+    """Parses the command line and runs `main`. Expected errors, and signals that `main` does not
+    handle, are one line on stderr. Returns the exit status: that of `main`, 2 after an error, 130
+    after Ctrl-C, or 143 after SIGTERM.
 
     Args:
-        arguments: class of the arguments, made by `options`, in the module that has the command's name.
+        arguments: class of the arguments, made by `options`, in the module that has the command's
+            name.
         main: gets the parsed arguments and returns the exit status.
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
@@ -97,7 +103,8 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
             os._exit(status)
         if missing := missing_platform():
             return print_error(
-                f"JAX_PLATFORMS is {missing!r}, but JAX has no such platform on this machine: unset it, or set cpu"
+                f"JAX_PLATFORMS is {missing!r}, but JAX has no such platform on this machine: "
+                "unset it, or set cpu"
             )
         if isinstance(error, OSError) and error.errno in FULL:
             return print_error(f"{error.filename or 'a file'}: {error.strerror}")
@@ -121,7 +128,8 @@ def print_line(text: str) -> None:
 
 
 def misfit_status(strict: bool, misfits: int) -> int:
-    """The exit status after solves with a number of notes on what does not fit, which `strict` tells from success."""
+    """The exit status after solves with a number of notes on what does not fit, which `strict`
+    tells from success."""
     if not (strict and misfits):
         return 0
     print("error: --strict: what was measured does not fit, see the notes above", file=sys.stderr)
@@ -138,11 +146,16 @@ def notes_printed(output: Callable[[str], object] = print_line) -> Iterator[None
 
 
 def console(width: int = 120, **options: Any) -> Any:
-    """A console of rich that breaks no lines; its tables are `width` characters wide if it is no terminal."""
+    """A console of rich that breaks no lines; its tables are `width` characters wide if it is no
+    terminal."""
     from rich.console import Console
 
     made = Console(soft_wrap=True, highlight=False, **options)
-    return made if made.is_terminal else Console(soft_wrap=True, highlight=False, width=width, **options)
+    return (
+        made
+        if made.is_terminal
+        else Console(soft_wrap=True, highlight=False, width=width, **options)
+    )
 
 
 def exit_with(status: int) -> NoReturn:
@@ -153,8 +166,9 @@ def exit_with(status: int) -> NoReturn:
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Keeps freed memory, loads LAPACK, and keeps compiled programs: if `untraced` those that are compiled in parallel,
-    which are found without tracing them (`keep_programs`), otherwise all of them, by JAX's own cache."""
+    """Keeps freed memory, loads LAPACK, and keeps compiled programs: if `untraced` those that are
+    compiled in parallel, which are found without tracing them (`keep_programs`), otherwise all of
+    them, by JAX's own cache."""
     from jaxba.runtime import process
     from jaxba.runtime.program_cache import keep_programs, keep_programs_by_jax
 
@@ -167,7 +181,8 @@ def prepare_process(*, untraced: bool = False) -> None:
 
 
 def check_extra(module: str) -> None:
-    """Raises a UsageError that names the package to install, if a module of jaxba needs one that is missing."""
+    """Raises a UsageError that names the package to install, if a module of jaxba needs one that is
+    missing."""
     try:
         importlib.import_module(module)
     except ImportError as error:
@@ -181,8 +196,9 @@ def require(fulfilled: bool, message: str) -> None:
 
 
 def check_writable(option: str, path: str | None) -> None:
-    """Checks that an output file can be written, before any work; None and names of streams are accepted. Raises
-    UsageError: the folder is missing or not writable, the file is read-only, or the path is that of a folder."""
+    """Checks that an output file can be written, before any work; None and names of streams are
+    accepted. Raises UsageError: the folder is missing or not writable, the file is read-only, or
+    the path is that of a folder."""
     from jaxba.io.files import STREAMS
 
     if path is None or path.startswith(STREAMS):
@@ -190,20 +206,25 @@ def check_writable(option: str, path: str | None) -> None:
     target = Path(os.path.realpath(path))  # a symbolic link is kept, and its target is written
     require(not target.is_dir(), f"{option} {path}: is a directory")
     separators = tuple(filter(None, (os.sep, os.altsep)))
-    require(not path.endswith(separators), f"{option} {path}: is the name of a directory, not of a file")
+    require(
+        not path.endswith(separators), f"{option} {path}: is the name of a directory, not of a file"
+    )
     if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is written directly
         require(os.access(path, os.W_OK), f"{option} {path}: cannot be written")
         return
     folder = target.parent if Path(path).is_symlink() else Path(path).parent
     require(target.parent.is_dir(), f"{option} {path}: folder {folder} does not exist")
-    require(os.access(target.parent, os.W_OK), f"{option} {path}: folder {folder} cannot be written")
+    require(
+        os.access(target.parent, os.W_OK), f"{option} {path}: folder {folder} cannot be written"
+    )
     read_only = target.exists() and not target.stat().st_mode & _WRITABLE
     require(not read_only, f"{option} {path}: is a read-only file")
 
 
 def check_folder(option: str, path: str) -> None:
-    """Checks that an output folder can be created or written, before any work is done. Raises UsageError: it is a file
-    or not writable, or it does not exist and its parent is missing or not writable."""
+    """Checks that an output folder can be created or written, before any work is done. Raises
+    UsageError: it is a file or not writable, or it does not exist and its parent is missing or not
+    writable."""
     target = Path(path).absolute()
     if not target.exists():
         return check_writable(option, str(Path(path)))  # without a trailing separator
@@ -212,8 +233,9 @@ def check_folder(option: str, path: str) -> None:
 
 
 def check_positive(**values: Any) -> None:
-    """Checks that numbers are positive, that tolerances (names ending in `tol`) are not negative, and that integers are
-    not too large for 32 bits. Values are by argument name. Raises UsageError: an invalid value; names the option."""
+    """Checks that numbers are positive, that tolerances (names ending in `tol`) are not negative,
+    and that integers are not too large for 32 bits. Values are by argument name. Raises UsageError:
+    an invalid value; names the option."""
     from jaxba.typing import LARGEST_COUNT
 
     for name, value in values.items():

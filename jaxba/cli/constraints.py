@@ -24,10 +24,11 @@ def surveyed(
     strict: bool = False,
     path: str | None = None,
 ) -> Survey:
-    """The problem with what the options and the file say. `constant` is what `--constant` names, `gauge` what `--gauge`
-    does, `file` that of `--constraints`, and `path` that of the problem. `strict` is as for `jaxba.survey`. Raises
-    UsageError: something is not in the problem; one line that names the option or the key. Raises ProblemError: as the
-    functions of `jaxba` that do it."""
+    """The problem with what the options and the file say. `constant` is what `--constant` names,
+    `gauge` what `--gauge` does, `file` that of `--constraints`, and `path` that of the problem.
+    `strict` is as for `jaxba.survey`. Raises UsageError: something is not in the problem; one line
+    that names the option or the key. Raises ProblemError: as the functions of `jaxba` that do
+    it."""
     held = lambda one: _held(one, constant)
     try:
         found, in_file = constrained(problem, file or {}, model=path, strict=strict, held=held)
@@ -38,12 +39,16 @@ def surveyed(
 
 def _held(problem: BundleProblem, constant: tuple[str, ...]) -> BundleProblem:
     try:
-        problem = hold(problem, numbers=[one.replace("-", "_") for one in constant if one not in PARTS])
+        problem = hold(
+            problem, numbers=[one.replace("-", "_") for one in constant if one not in PARTS]
+        )
     except ValueError as error:
         raise UsageError(f"--constant: {error}; or {', '.join(PARTS)}") from None
     try:
         of_frames = {"frames": "poses", "frame-rotations": "rotations"}
-        parts: dict[str, Any] = {of_frames[part]: "frames" for part in PARTS[4:] if part in constant}
+        parts: dict[str, Any] = {
+            of_frames[part]: "frames" for part in PARTS[4:] if part in constant
+        }
         return hold(problem, **(parts | {part: "all" for part in PARTS[:4] if part in constant}))
     except ValueError as error:
         raise UsageError(f"--constant: {error}") from None

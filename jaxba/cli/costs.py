@@ -1,7 +1,8 @@
 """The file of costs of several problems: a row for each, from which a later run knows what is done.
 
-Digests in a row say by which options and from which files a solution was made: what was made otherwise is not done.
-Files count by their contents, those in a folder of photos or depth maps by names, sizes and times."""
+Digests in a row say by which options and from which files a solution was made: what was made
+otherwise is not done. Files count by their contents, those in a folder of photos or depth maps by
+names, sizes and times."""
 
 from __future__ import annotations
 
@@ -60,12 +61,14 @@ class Row(NamedTuple):
         problem = result.problem
         sizes = problem.num_cameras, problem.num_points, problem.num_observations
         costs = result.initial_cost, result.final_cost, result.iterations
-        return cls(name, *sizes, *costs, result.termination.reason, "; ".join(result.notes), **digests)
+        return cls(
+            name, *sizes, *costs, result.termination.reason, "; ".join(result.notes), **digests
+        )
 
 
 def solved_rows(costs: Path) -> dict[str, Row]:
-    """The rows of solutions in a file, by their problems; none if there is no file. A last line that was cut is
-    dropped. In a file of an older version digests are empty."""
+    """The rows of solutions in a file, by their problems; none if there is no file. A last line
+    that was cut is dropped. In a file of an older version digests are empty."""
     if not costs.exists():
         return {}
     content = costs.read_bytes()
@@ -73,7 +76,9 @@ def solved_rows(costs: Path) -> dict[str, Row]:
     names, *lines = [line for line in csv.reader(whole) if line] or [[]]
     rows = [dict(zip(names, line, strict=True)) for line in lines if len(line) == len(names)]
     known = [{name: row[name] for name in Row._fields if name in row} for row in rows]
-    return {row["problem"]: Row(**row) for row in known if row.get("problem") and not row.get("error")}
+    return {
+        row["problem"]: Row(**row) for row in known if row.get("problem") and not row.get("error")
+    }
 
 
 def write_rows(costs: Path, rows: Iterable[Row]) -> None:

@@ -22,7 +22,8 @@ class Download:
     """Folder with the families. Default: that of the data set."""
 
     checksum: bool = True
-    """Compare the checksum; else unpack the file and compare its header with its name, as without a known one."""
+    """Compare the checksum; else unpack the file and compare its header with its name, as without a
+    known one."""
 
 
 @options
@@ -58,7 +59,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 for success, 2 for bad input or a failed download, 130 after Ctrl-C."""
+    """Runs the command. Exit status: 0 for success, 2 for bad input or a failed download, 130 after
+    Ctrl-C."""
     text = "Problems of BAL (Bundle Adjustment in the Large), in the folder JAXBA_BAL."
     return common.run_command(Arguments, _data, text, argv)
 
@@ -81,10 +83,15 @@ def _list(args: List) -> int:
 
     table = Table(box=None, header_style="bold", pad_edge=False)  # 80 columns wide
     for title in ("name", "cameras", "points", "file", "sha256", "here"):
-        table.add_column(title, no_wrap=True, justify="right" if title in ("cameras", "points") else "left")
+        table.add_column(
+            title, no_wrap=True, justify="right" if title in ("cameras", "points") else "left"
+        )
     for entry in select(args.names) if args.names else ENTRIES:
         file = entry.file.partition("/")[2]
-        known, here = ("known" if entry.sha256 else "no"), ("yes" if downloaded_path(entry) else "no")
+        known, here = (
+            ("known" if entry.sha256 else "no"),
+            ("yes" if downloaded_path(entry) else "no"),
+        )
         table.add_row(entry.name, str(entry.cameras), str(entry.points), file, known, here)
     console = common.console()
     console.print(table)
@@ -93,7 +100,14 @@ def _list(args: List) -> int:
 
 
 def _download(args: Download) -> int:
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
 
     from jaxba.datasets.bal.paths import data_folder, select
 
@@ -103,10 +117,19 @@ def _download(args: Download) -> int:
     from jaxba.datasets.bal import download
 
     console = common.console()
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+    )
     status = 0
     with Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+        *columns,
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
     ) as progress:
         for entry in entries:
             task = progress.add_task(entry.name, total=None)
@@ -115,9 +138,14 @@ def _download(args: Download) -> int:
                 progress.update(task, completed=done, total=total)
 
             try:
-                path, new = download.fetch(entry, folder, show, args.base_url or download.BASE_URL, args.checksum)
+                path, new = download.fetch(
+                    entry, folder, show, args.base_url or download.BASE_URL, args.checksum
+                )
             except KeyboardInterrupt:
-                console.print("interrupted; what was downloaded is kept, run the same command again to continue")
+                console.print(
+                    "interrupted; what was downloaded is kept, run the same command again to "
+                    "continue"
+                )
                 return common.INTERRUPTED
             except download.DownloadError as error:
                 progress.remove_task(task)
@@ -133,5 +161,9 @@ def _download(args: Download) -> int:
 
 def _state(new: bool, checksum: bool) -> str:
     if not checksum:
-        return "downloaded, unpacks, header fits its name" if new else "was here (no checksum compared)"
+        return (
+            "downloaded, unpacks, header fits its name"
+            if new
+            else "was here (no checksum compared)"
+        )
     return "downloaded, checksum agrees" if new else "was here, checksum agrees"

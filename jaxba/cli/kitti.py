@@ -1,4 +1,5 @@
-"""`jaxba-kitti`: makes a problem from the images of a KITTI odometry sequence, and computes trajectory errors."""
+"""`jaxba-kitti`: makes a problem from the images of a KITTI odometry sequence, and computes
+trajectory errors."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 
-EVALUATE = "evaluate"  # first argument of the subcommand; a folder of this name can be given as ./evaluate
+# first argument of the subcommand; a folder of this name can be given as ./evaluate
+EVALUATE = "evaluate"
 
 options(Build)
 
@@ -42,14 +44,15 @@ class Files:
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt."""
 
     out: Annotated[str, "FILE"] = "kitti.txt.bz2"
-    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz); NAME.frames.json beside it has the frames."""
+    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz); NAME.frames.json beside it
+    has the frames."""
 
     frames: Annotated[str, "A:B:STEP"] = ":"
     """Range of frame numbers, without the end, such as 0:200."""
 
     poses: Annotated[str | None, "FILE"] = None
-    """True poses, 12 numbers per line for every frame from 0. With --start vo only the error of the start is computed
-    from them."""
+    """True poses, 12 numbers per line for every frame from 0. With --start vo only the error of the
+    start is computed from them."""
 
     camera: int = 0
     """Number of the camera, from 0 (image_0 and P0) to 3."""
@@ -74,7 +77,8 @@ class EvaluateArguments:
     """Solutions of the problem by jaxba-solve, BAL files."""
 
     poses: Annotated[str | None, "FILE"] = None
-    """True poses of the whole sequence, 12 numbers per line. Without them no errors are computed."""
+    """True poses of the whole sequence, 12 numbers per line. Without them no errors are
+    computed."""
 
     out: Annotated[str, "FOLDER"] = "runs/kitti"
     """Folder of evaluation.json and the aligned trajectories."""
@@ -97,11 +101,18 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def _check(args: Arguments) -> None:
     common.check_positive(
-        keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
+        keypoints=args.keypoints,
+        reach=args.reach,
+        max_error=args.max_error,
+        min_matches=args.min_matches,
     )
-    common.require(math.isfinite(args.max_error), f"--max-error must be finite, is {args.max_error:g}")
+    common.require(
+        math.isfinite(args.max_error), f"--max-error must be finite, is {args.max_error:g}"
+    )
     common.require(args.min_views >= 2, f"--min-views must be at least 2, is {args.min_views}")
-    common.require(0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
+    common.require(
+        0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}"
+    )
     common.require(args.start == "vo" or args.poses is not None, "--start poses needs --poses")
     common.check_writable("--out", args.out)
     check_output(args.out)
@@ -146,12 +157,15 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
         poses = lambda frames: poses_of(table, frames, sequence.calibration)
         poses(sequence.numbers)  # raises errors before any work is done
     center = (sequence.calibration.cx, sequence.calibration.cy)
-    note_center(args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence))
+    note_center(
+        args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence)
+    )
     return sequence, poses
 
 
 def _write(problem: BundleProblem, frames: tuple[int, ...], sequence: Any, args: Arguments) -> None:
-    """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
+    """Writes the file of frames first, then the problem, so that there is never a problem without
+    its frames."""
     from jaxba import __version__
     from jaxba.kitti.opencv import cv2
 
@@ -167,26 +181,51 @@ def _write(problem: BundleProblem, frames: tuple[int, ...], sequence: Any, args:
 
 
 def _build_table(title: str, problem: BundleProblem, frames: tuple[int, ...], poses: Any) -> Any:
-    table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
+    table = _table(
+        title,
+        "frames",
+        "key-frames",
+        "points",
+        "observations",
+        "mean error (px)",
+        "ATE of the start (m)",
+    )
     error, ate = np.linalg.norm(geometry.residuals(problem), axis=1).mean(), "-"
     if poses is not None:
         try:
-            ate = f"{evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))['ate_m']['rmse']:.3f}"
+            scores = evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))
+            ate = f"{scores['ate_m']['rmse']:.3f}"
         except ProblemError:  # a straight line, or two cameras
             ate = "undefined"
-    numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
+    numbers = (
+        problem.num_cameras,
+        problem.num_points,
+        problem.num_observations,
+        f"{error:.3f}",
+        ate,
+    )
     table.add_row(f"{frames[0]} to {frames[-1]}", *map(str, numbers))
     return table
 
 
 def _evaluate(args: EvaluateArguments) -> int:
     files, folder = [args.problem, *args.solutions], Path(args.out)
-    names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
+    names = [
+        f"poses-{number}-{Path(strip_compression(path)).stem}.txt"
+        for number, path in enumerate(files)
+    ]
     names += ["evaluation.json", "poses-truth.txt"]
-    read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
+    read = {
+        PROBLEM: [one for path in files for one in problem_files(path)],
+        "the file of --poses": [args.poses],
+    }
     check_apart({"--out": [folder / name for name in names]}, read)
     side = read_sidecar(args.problem)
-    truth = None if args.poses is None else poses_of(read_poses(args.poses), side.frames, side.calibration)
+    truth = (
+        None
+        if args.poses is None
+        else poses_of(read_poses(args.poses), side.frames, side.calibration)
+    )
     with common.notes_printed():
         results = evaluate.evaluate(files, side, truth)
     rows = [numbers for numbers, _ in results]
@@ -212,17 +251,31 @@ def _evaluate_table(results: list[dict[str, Any]], truth: Any) -> Any:
     names: tuple[str, ...] = ()
     if truth is not None:
         title += f", {path_length(truth):.1f} m of path; after similarity alignment"
-        names = ("ATE (m)", "largest (m)", "RPE (m)", "RPE (deg)", "segments (%)", "(deg/m)", "number")
+        names = (
+            "ATE (m)",
+            "largest (m)",
+            "RPE (m)",
+            "RPE (deg)",
+            "segments (%)",
+            "(deg/m)",
+            "number",
+        )
     table = _table(title, "file", "rms (px)", *names)
     for found in results:
         row = [found["name"], f"{found['rms_px']:.4f}"]
         if truth is not None:
             row += [f"{found['ate_m'][name]:.3f}" for name in ("rmse", "largest")]
-            row += [f"{found[name]['rmse']:.4f}" for name in ("rpe_translation_m", "rpe_rotation_deg")]
+            row += [
+                f"{found[name]['rmse']:.4f}" for name in ("rpe_translation_m", "rpe_rotation_deg")
+            ]
             if (segments := found["segments"]) is None:
                 row += ["-"] * 3
             else:
-                row += [f"{segments['translation']:.3f}", f"{segments['rotation']:.5f}", str(segments["segments"])]
+                row += [
+                    f"{segments['translation']:.3f}",
+                    f"{segments['rotation']:.5f}",
+                    str(segments["segments"]),
+                ]
         table.add_row(*row)
     return table
 

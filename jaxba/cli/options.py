@@ -1,4 +1,5 @@
-"""The options of a command: a dataclass from which tyro makes the parser, and the help that it prints."""
+"""The options of a command: a dataclass from which tyro makes the parser, and the help that it
+prints."""
 
 from __future__ import annotations
 
@@ -13,7 +14,17 @@ from functools import cache
 from io import StringIO
 from itertools import pairwise
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import tyro
 
@@ -29,12 +40,14 @@ def options(cls: type[Arguments]) -> type[Arguments]:
     """Makes a frozen dataclass of options, or gives one its help.
 
     The text below a field is its help, whatever the lengths of its lines. A text in the annotation,
-    `Annotated[str, "FILE"]`, stands for the value in the help. A class that inherits from several such classes has
-    their options, in the help a group for each class."""
+    `Annotated[str, "FILE"]`, stands for the value in the help. A class that inherits from several
+    such classes has their options, in the help a group for each class."""
     texts, hints = _texts(cls), get_type_hints(cls, include_extras=True)
     for name in cls.__annotations__:
         default = getattr(cls, name, None)
-        kind, *extras = get_args(hints[name]) if get_origin(hints[name]) is Annotated else [hints[name]]
+        kind, *extras = (
+            get_args(hints[name]) if get_origin(hints[name]) is Annotated else [hints[name]]
+        )
         shown = tyro.conf.arg(
             help=texts.get(name),
             metavar=next((extra for extra in extras if isinstance(extra, str)), _metavar(kind)),
@@ -60,7 +73,11 @@ def _texts(cls: type) -> dict[str, str]:
     """The text below each field of a class, in one line."""
     found = _classes(cls.__module__).get(cls.__name__)
     pairs = pairwise(found.body if found else ())
-    fields = [pair for pair in pairs if isinstance(pair[0], ast.AnnAssign) and isinstance(pair[1], ast.Expr)]
+    fields = [
+        pair
+        for pair in pairs
+        if isinstance(pair[0], ast.AnnAssign) and isinstance(pair[1], ast.Expr)
+    ]
     return {name.target.id: " ".join(text.value.value.split()) for name, text in fields}
 
 
@@ -69,7 +86,9 @@ def _metavar(kind: Any) -> str | None:
     if get_origin(kind) not in (Union, UnionType):
         return None
     kind = next(one for one in get_args(kind) if one is not NoneType)
-    return f"{{{','.join(get_args(kind))}}}" if get_origin(kind) is Literal else kind.__name__.upper()
+    return (
+        f"{{{','.join(get_args(kind))}}}" if get_origin(kind) is Literal else kind.__name__.upper()
+    )
 
 
 def parse(
@@ -95,17 +114,24 @@ def parse(
         return _error(drawn.getvalue()) if end.code == BAD_INPUT else None
     if not groups:
         return parsed  # pyright: ignore[reportReturnType]
-    return arguments(**{name: value for group in vars(parsed).values() for name, value in vars(group).items()})
+    return arguments(
+        **{name: value for group in vars(parsed).values() for name, value in vars(group).items()}
+    )
 
 
 def _error(drawn: str) -> str:
     """The message of tyro in one line.
 
-    It is a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and
-    how to get help. In an encoding that has lines the title stands in the first rule, and lines are its border."""
+    It is a box: the title, a rule, the message, a rule, help on the option or options with a
+    similar name, a rule, and how to get help. In an encoding that has lines the title stands in the
+    first rule, and lines are its border."""
     text = _COLORS.sub("", drawn)
     parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
-    message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text
+    message = (
+        " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split())
+        if len(parts) > 1
+        else text
+    )
     message = _in_plain_words(message)
     near = re.findall(r"^. {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
     return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
@@ -123,9 +149,12 @@ def _in_plain_words(message: str) -> str:
     if parsed and value:
         kind = _KINDS[value[1] or value[2]]
         return f"{parsed[1]} must be {kind}, not {value[3]}"
-    choice = re.match(r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\)\.$", message)
+    choice = re.match(
+        r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\)\.$", message
+    )
     if choice:
-        known = sorted({*re.findall(r"'([^']*)'", choice[3])} - {"None"})  # tyro has them in any order
+        # tyro has them in any order
+        known = sorted({*re.findall(r"'([^']*)'", choice[3])} - {"None"})
         return f"{choice[2]} must be one of {', '.join(known)}, not {choice[1]}"
     missing = re.match(r"Missing value for argument '(.*)'\. Expected 1 values\.$", message)
     return f"{missing[1]} needs a value" if missing else message

@@ -1,4 +1,5 @@
-"""No command writes over what it reads: every output is held against every input and the other outputs, by identity."""
+"""No command writes over what it reads: every output is held against every input and the other
+outputs, by identity."""
 
 from __future__ import annotations
 
@@ -14,10 +15,12 @@ from jaxba.io.formats import files_of
 PROBLEM = "a file of the problem"  # what a message calls a file of a problem that is read
 
 
-def check_apart(written: Mapping[str, Iterable[StrPath | None]], read: Mapping[str, Iterable[StrPath | None]]) -> None:
-    """Checks that no output is a file that is read, or another output, also by a link or another spelling. Outputs are
-    given by the option that names them, None for no file; inputs by what they are for messages, such as `the file of
-    --constraints`. Raises UsageError: one is; one line."""
+def check_apart(
+    written: Mapping[str, Iterable[StrPath | None]], read: Mapping[str, Iterable[StrPath | None]]
+) -> None:
+    """Checks that no output is a file that is read, or another output, also by a link or another
+    spelling. Outputs are given by the option that names them, None for no file; inputs by what they
+    are for messages, such as `the file of --constraints`. Raises UsageError: one is; one line."""
     inputs = {_identity(path): what for what, paths in read.items() for path in paths if path}
     outputs: dict[Hashable, str] = {}
     for option, paths in written.items():
@@ -27,15 +30,20 @@ def check_apart(written: Mapping[str, Iterable[StrPath | None]], read: Mapping[s
             if one is None:
                 continue
             if one in inputs:
-                raise UsageError(f"{option} {display_name(str(path))}: is {inputs[one]}, and would be replaced")
+                raise UsageError(
+                    f"{option} {display_name(str(path))}: is {inputs[one]}, and would be replaced"
+                )
             if one in outputs:
-                raise UsageError(f"{outputs[one]} and {option} name the same file, {display_name(str(path))}")
+                raise UsageError(
+                    f"{outputs[one]} and {option} name the same file, {display_name(str(path))}"
+                )
             new[one] = option
         outputs |= new
 
 
 def problem_files(path: str | None) -> list[StrPath]:
-    """The files that a problem is read from, and the frames that `jaxba-kitti` has written beside one."""
+    """The files that a problem is read from, and the frames that `jaxba-kitti` has written beside
+    one."""
     return [] if path is None else [*files_of(path), sidecar_path(path)]
 
 
@@ -48,7 +56,8 @@ def policy_file(policy: str) -> str | None:
 
 
 def _identity(path: StrPath) -> Hashable:
-    """What all names of a file share; of another stream of this process its number, None for a device or a folder."""
+    """What all names of a file share; of another stream of this process its number, None for a
+    device or a folder."""
     number = stream_number(path)
     try:
         found = os.stat(path) if number is None else os.fstat(number)

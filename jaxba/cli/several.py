@@ -1,4 +1,5 @@
-"""`jaxba-solve` with several problems: by `jaxba.solve_many`, with a file of costs from which a run goes on."""
+"""`jaxba-solve` with several problems: by `jaxba.solve_many`, with a file of costs from which a run
+goes on."""
 
 from __future__ import annotations
 
@@ -11,7 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from jaxba.cli import common
-from jaxba.cli.costs import COSTS, Row, append_row, files_digest, is_there, options_digest, solved_rows, write_rows
+from jaxba.cli.costs import (
+    COSTS,
+    Row,
+    append_row,
+    files_digest,
+    is_there,
+    options_digest,
+    solved_rows,
+    write_rows,
+)
 from jaxba.cli.output import store
 from jaxba.cli.overwriting import check_apart, problem_files
 from jaxba.damping import DampingPolicy
@@ -41,12 +51,13 @@ FOR_ONE = (
 )
 """Options of a single problem."""
 
-PROGRESS_S = 0.2, 10.0  # seconds between lines of progress on a terminal, where each replaces the last, and elsewhere
+# seconds between lines of progress on a terminal, where each replaces the last, and elsewhere
+PROGRESS_S = 0.2, 10.0
 
 
 def inputs(problems: Sequence[str]) -> list[str]:
-    """The paths of several problems; of a folder that is none itself what it holds. Empty for a single problem. Raises
-    UsageError: one is standard input. Raises ProblemError: as `resolve`."""
+    """The paths of several problems; of a folder that is none itself what it holds. Empty for a
+    single problem. Raises UsageError: one is standard input. Raises ProblemError: as `resolve`."""
     common.require(len(problems) < 2 or "-" not in problems, "- is for one problem")
     found, folders = list[str](), 0
     for path in map(resolve, problems):
@@ -65,13 +76,15 @@ def solve_all(
     policy: DampingPolicy,
     options: SolveOptions,
 ) -> int:
-    """Solves problems, `read` from their paths, and writes solutions under their names. One that fails is one line, and
-    the others go on. Exit status: 0, 2 if any has failed, 3 with `--strict` if what was measured does not fit some of
-    them, 130 after Ctrl-C. Raises UsageError: the folder or the
-    options."""
+    """Solves problems, `read` from their paths, and writes solutions under their names. One that
+    fails is one line, and the others go on. Exit status: 0, 2 if any has failed, 3 with `--strict`
+    if what was measured does not fit some of them, 130 after Ctrl-C. Raises UsageError: the folder
+    or the options."""
     given = [f"--{name.replace('_', '-')}" for name in FOR_ONE if getattr(args, name)]
     common.require(not given, f"{', '.join(given)}: for one problem, not for {len(paths)}")
-    common.require(bool(args.output) or not args.resume, "--resume goes on with the folder of --output")
+    common.require(
+        bool(args.output) or not args.resume, "--resume goes on with the folder of --output"
+    )
     names = _names(paths)
     folder = Path(args.output) if args.output else None
     made_by = options_digest(args, policy, options)
@@ -106,7 +119,8 @@ def solve_all(
     failed = len(rows) - len(solved)
     total = lambda name: sum(float(getattr(row, name)) for row in solved)
     common.print_line(
-        f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in {time.monotonic() - began:.1f} s\n"
+        f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in "
+        f"{time.monotonic() - began:.1f} s\n"
         f"cost {total('initial_cost'):.6g} -> {total('final_cost'):.6g} in all, "
         f"{total('iterations') / max(1, len(solved)):.1f} iterations each"
     )
@@ -118,7 +132,9 @@ def solve_all(
     return (
         common.BAD_INPUT
         if failed
-        else common.misfit_status(args.strict, sum(bool(row.notes) for row in (*done.values(), *rows)))
+        else common.misfit_status(
+            args.strict, sum(bool(row.notes) for row in (*done.values(), *rows))
+        )
     )
 
 
@@ -146,11 +162,14 @@ class _Problems:
 
 
 def _names(paths: Sequence[str]) -> list[str]:
-    """Names of solutions: paths below the folder that all have in common, with .txt if their format is only read."""
+    """Names of solutions: paths below the folder that all have in common, with .txt if their format
+    is only read."""
     absolute = [os.path.abspath(path) for path in paths]
     common_folder = os.path.commonpath([os.path.dirname(path) for path in absolute])
     names = [_written(os.path.relpath(path, common_folder), path) for path in absolute]
-    twice = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else ()
+    twice = (
+        {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else ()
+    )
     common.require(not twice, f"{next(iter(twice), '')}: named twice")
     return names
 
@@ -162,7 +181,9 @@ def _written(name: str, source: str) -> str:
     return f"{name}.txt" if lost and not is_colmap(source) else name
 
 
-def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: str, *, resume: bool) -> dict[str, Row]:
+def _begin(
+    folder: Path, paths: Sequence[str], names: Sequence[str], made_by: str, *, resume: bool
+) -> dict[str, Row]:
     """Makes the folder and its file of costs, and says what is done already.
 
     Args:
@@ -173,20 +194,26 @@ def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: st
         resume: whether a run may go on.
 
     Returns:
-        Rows of solutions that are there, made by the same options from the same files, by their names.
+        Rows of solutions that are there, made by the same options from the same files, by their
+        names.
 
     Raises:
-        UsageError: a solution would replace a file of a problem, or the folder holds what it may not; one line."""
+        UsageError: a solution would replace a file of a problem, or the folder holds what it may
+            not; one line."""
     common.check_folder("--output", str(folder))
     written = {str(path): [folder / name] for path, name in zip(paths, names, strict=True)}
     check_apart(written, {"a problem": [file for path in paths for file in problem_files(path)]})
     folder.mkdir(exist_ok=True)
     costs = folder / COSTS
     where = f"--output {folder}: holds {COSTS} of"
-    common.require(resume or not costs.exists(), f"{where} an earlier run; --resume goes on with it")
+    common.require(
+        resume or not costs.exists(), f"{where} an earlier run; --resume goes on with it"
+    )
     rows = solved_rows(costs)
     same = all(row.options == made_by for row in rows.values())
-    common.require(same, f"{where} other options, constraints or policy: repeat those, or name another folder")
+    common.require(
+        same, f"{where} other options, constraints or policy: repeat those, or name another folder"
+    )
     path_of = dict(zip(names, paths, strict=True))
     there = {name for name in rows if name in path_of and is_there(folder / name)}
     done = {name for name in there if rows[name].files == files_digest(path_of[name])}
@@ -196,7 +223,9 @@ def _begin(folder: Path, paths: Sequence[str], names: Sequence[str], made_by: st
         common.print_line(f"{len(done)} of {len(paths)} are there already")
     if anew:
         changed, lost = len(there - done), len(anew) - len(there - done)
-        common.print_line(f"solved anew: {changed} whose files have changed, {lost} whose solutions are not there")
+        common.print_line(
+            f"solved anew: {changed} whose files have changed, {lost} whose solutions are not there"
+        )
     return {name: rows[name] for name in done}
 
 

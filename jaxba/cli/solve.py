@@ -33,7 +33,14 @@ from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.gauge import Gauge
 from jaxba.problem.hold import hold
 from jaxba.problem.losses import Loss
-from jaxba.problem.options import ConjugateGradients, Intrinsics, LinearSolverChoice, Preconditioner, Rotation, Scaling
+from jaxba.problem.options import (
+    ConjugateGradients,
+    Intrinsics,
+    LinearSolverChoice,
+    Preconditioner,
+    Rotation,
+    Scaling,
+)
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
 from jaxba.scenes import DEFAULT_SCENES, random_scene
@@ -57,7 +64,10 @@ _STDOUT = 1
 DEFAULT_SCENE = next(iter(DEFAULT_SCENES))
 """Name of the scene that is solved if no problem is given."""
 
-AXES = "rotation (radians, left perturbation), then translation; in the camera's frame y is up, and it looks along -z"
+AXES = (
+    "rotation (radians, left perturbation), then translation; in the camera's frame y is up, "
+    "and it looks along -z"
+)
 """What the rows of `poses` in a file of covariances are."""
 
 OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
@@ -82,8 +92,8 @@ class Problem:
     """Optimise principal points of a COLMAP model, too."""
 
     constant: Annotated[tuple[str, ...], "PART ..."] = ()
-    """Parts that stay as they are: poses, rotations, points, focal, distortion, principal-point, or numbers of lenses
-    such as k2; of rigs extrinsics, frames (their poses) and frame-rotations."""
+    """Parts that stay as they are: poses, rotations, points, focal, distortion, principal-point, or
+    numbers of lenses such as k2; of rigs extrinsics, frames (their poses) and frame-rotations."""
 
     gauge: Gauge | None = None
     """Fix position, orientation and scale. Default: as in --constraints."""
@@ -98,8 +108,8 @@ class Problem:
     """Width of its quadratic part, pixels."""
 
     strict: bool = False
-    """Fail instead of skipping invalid parts of the input. Exit status 3 if what was measured does not fit; the
-    solution is written."""
+    """Fail instead of skipping invalid parts of the input. Exit status 3 if what was measured does
+    not fit; the solution is written."""
 
 
 @options
@@ -107,33 +117,34 @@ class Step:
     """How a step is computed."""
 
     policy: Annotated[str, "NAME"] = DEFAULT_POLICY
-    """Damping policy, which chooses lambda: guarded (1e-6, then 1e-8 until a step fails), bold (the smallest lambda
-    that the guard of agents allows), learned (the shipped network, without embedded iterations), a .safetensors file of
-    jaxba-train, or a rule: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most
-    rules take the first lambda, as in classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is
-    --refine-points K."""
+    """Damping policy, which chooses lambda: guarded (1e-6, then 1e-8 until a step fails), bold (the
+    smallest lambda that the guard of agents allows), learned (the shipped network, without embedded
+    iterations), a .safetensors file of jaxba-train, or a rule: ceres, classic, gtsam, nielsen,
+    stba, theseus, schedule, gauss-newton, constant:1e-4. Most rules take the first lambda, as in
+    classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is --refine-points K."""
 
     method: Annotated[str, "NAME"] = DEFAULT_METHOD
-    """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. deeplm: conjugate
-    gradients on all variables."""
+    """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. deeplm:
+    conjugate gradients on all variables."""
 
     recipes: int | None = None
-    """Solve by so many policies side by side, this one and the next of a list; the lowest end wins."""
+    """Solve by so many policies side by side, this one and the next of a list; the lowest end
+    wins."""
 
     refine_points: int | None = None
-    """Point iterations after each camera step. Default: those that the policy brings (guarded, bold, learned); none
-    for a rule."""
+    """Point iterations after each camera step. Default: those that the policy brings (guarded,
+    bold, learned); none for a rule."""
 
     repairs: Repairs | None = None
-    """Of a bad step. none; trials: up to three shorter steps; all: camera rounds and pattern moves, too. Default: those
-    of the policy, but none with --refine-points."""
+    """Of a bad step. none; trials: up to three shorter steps; all: camera rounds and pattern moves,
+    too. Default: those of the policy, but none with --refine-points."""
 
     min_gain: float | None = None
     """Gain ratio that a step must exceed. Default: that of the policy."""
 
     linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
-    """explicit: factor the reduced camera system. sparse: form it for conjugate gradients. implicit: do not form it.
-    cg: twelve iterations of that. auto: by size."""
+    """explicit: factor the reduced camera system. sparse: form it for conjugate gradients.
+    implicit: do not form it. cg: twelve iterations of that. auto: by size."""
 
     preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
     """Of conjugate gradients. two-level: with a coarse system of the motion of clusters."""
@@ -142,19 +153,19 @@ class Step:
     """Matrix that lambda multiplies. Default: that of a learned policy; diagonal for a rule."""
 
     rotation: Rotation | None = None
-    """angle-axis: steps of the file's numbers, as in Ceres. manifold: multiplication by exp(step). Default: that of a
-    learned policy; angle-axis for a rule."""
+    """angle-axis: steps of the file's numbers, as in Ceres. manifold: multiplication by exp(step).
+    Default: that of a learned policy; angle-axis for a rule."""
 
     dtype: Dtype = DEFAULTS.dtype
     """mixed: float64, but the reduced camera system in float32."""
 
     pad: Literal["auto", "yes", "no"] = "auto"
-    """Pad sizes, so that similar problems share a compiled program. auto: up to 64 cameras and 60,000 observations, not
-    if fully compiled."""
+    """Pad sizes, so that similar problems share a compiled program. auto: up to 64 cameras and
+    60,000 observations, not if fully compiled."""
 
     compilation: Compilation = DEFAULTS.compilation
-    """quick: compile in a third of the time, and iterate two to six times as long. full: the contrary. auto: full once
-    that pays; on a GPU always."""
+    """quick: compile in a third of the time, and iterate two to six times as long. full: the
+    contrary. auto: full once that pays; on a GPU always."""
 
     prepare: bool = False
     """Only compile, for the given problems or usual ones."""
@@ -177,7 +188,8 @@ class Stop:
     """Stop at this largest gradient entry."""
 
     within: float = DEFAULTS.within
-    """Stop when the cost is estimated to be nearer to its end, relatively: 1e-3 where 0.1% does not matter."""
+    """Stop when the cost is estimated to be nearer to its end, relatively: 1e-3 where 0.1% does not
+    matter."""
 
     seconds: float | None = None
     """Limit of time, compilation included."""
@@ -194,9 +206,10 @@ class Output:
     """What is written and shown."""
 
     output: Annotated[str | None, "FILE"] = None
-    """Solution in BAL format, compressed by its ending; .out: Bundler's; .ply: for a viewer; .json: cameras for
-    nerfstudio; -: standard output. An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem
-    is one, but for these endings, .txt, .bal, .bz2, .gz and .xz. Of several problems: a folder."""
+    """Solution in BAL format, compressed by its ending; .out: Bundler's; .ply: for a viewer; .json:
+    cameras for nerfstudio; -: standard output. An existing folder or NAME/ becomes a COLMAP model;
+    so does any name if the problem is one, but for these endings, .txt, .bal, .bz2, .gz and .xz. Of
+    several problems: a folder."""
 
     checkpoint: Annotated[str | None, "FILE"] = None
     """Solve that goes on if killed; written every minute."""
@@ -239,30 +252,35 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 if a solution was found and written, 2 for bad input, 3 with `--strict` if what
-    was measured does not fit the solution, 130 after a second Ctrl-C."""
+    """Runs the command. Exit status: 0 if a solution was found and written, 2 for bad input, 3 with
+    `--strict` if what was measured does not fit the solution, 130 after a second Ctrl-C."""
     try:
         words = translated(sys.argv[1:] if argv is None else argv)
     except common.UsageError as error:
         return common.print_error(str(error))
-    return common.run_command(Arguments, _run, "Bundle adjustment of a problem, or of several.", words)
+    return common.run_command(
+        Arguments, _run, "Bundle adjustment of a problem, or of several.", words
+    )
 
 
 def solver_name(args: Arguments) -> SolverName:
-    """The name of the solver in records and tables. Raises UsageError: the name of the policy states another number of
-    point iterations than `--refine-points`."""
+    """The name of the solver in records and tables. Raises UsageError: the name of the policy
+    states another number of point iterations than `--refine-points`."""
     name = replace(parse_policy(args.policy), dtype=args.dtype, method=args.method)
     if args.refine_points is None:
         return name
     _, stated_points, stated = split_refinement(args.policy)
     if stated and stated_points != args.refine_points:
-        raise common.UsageError(f"--refine-points {args.refine_points} contradicts --policy {args.policy}")
+        raise common.UsageError(
+            f"--refine-points {args.refine_points} contradicts --policy {args.policy}"
+        )
     return replace(name, refine_points=args.refine_points)
 
 
 def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
-    """The policy and the options for the arguments. Raises UsageError: a number out of range, or options that do not go
-    together; the message names the option. Raises InputError: as `make_policy` and `make_method`."""
+    """The policy and the options for the arguments. Raises UsageError: a number out of range, or
+    options that do not go together; the message names the option. Raises InputError: as
+    `make_policy` and `make_method`."""
     try:
         policy, options = adjusted(*solver_name(args).build(), args.repairs, args.min_gain)
         trained = options.step_options(policy).coordinates
@@ -290,7 +308,8 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
 
 
 def _about_option(message: str) -> str:
-    """A message that begins with the name of a field, with that name replaced by the command-line option."""
+    """A message that begins with the name of a field, with that name replaced by the command-line
+    option."""
     field, _, rest = message.partition(" ")
     option = OPTION_OF_FIELD.get(field, field)
     return f"--{option.replace('_', '-')} {rest}" if hasattr(Arguments, option) else message
@@ -329,24 +348,38 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
-    common.require(not (args.reject and args.retriangulate), "--reject and --retriangulate exclude each other")
+    common.require(
+        not (args.reject and args.retriangulate), "--reject and --retriangulate exclude each other"
+    )
     _check_recipes(args)
     _check_checkpoint(args)
     problems = [name for name in (args.problem, *args.more) if name]
     if args.prepare:
         return _prepare(args, problems, policy, options)
-    if args.more or args.resume or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem)):
+    if (
+        args.more
+        or args.resume
+        or (args.problem and os.path.isdir(args.problem) and not is_colmap(args.problem))
+    ):
         from jaxba.cli import several
 
         if paths := several.inputs(problems):
-            return several.solve_all(args, paths, functools.partial(_one_of_several, args), policy, options)
+            return several.solve_all(
+                args, paths, functools.partial(_one_of_several, args), policy, options
+            )
     common.require(not args.resume, "--resume is for several problems")
     from jaxba.runtime.distributed import together
 
     path, survey = together(lambda: _checked(args))
     problem = survey.problem
     common.prepare_process(untraced=not _is_divided(args))
-    name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
+    name = (
+        f"random scene {DEFAULT_SCENE}"
+        if args.problem is None
+        else path
+        if args.problem == STREAM
+        else args.problem
+    )
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     watch, end = view.watched(problem, path, args.record, args.view)
@@ -380,7 +413,9 @@ def _solve(args: Arguments) -> int:
     return common.misfit_status(args.strict, len(solution.notes))
 
 
-def _prepare(args: Arguments, names: list[str], policy: DampingPolicy, options: SolveOptions) -> int:
+def _prepare(
+    args: Arguments, names: list[str], policy: DampingPolicy, options: SolveOptions
+) -> int:
     """Compiles programs for some problems, or for usual ones. Raises UsageError: none are kept."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -388,7 +423,12 @@ def _prepare(args: Arguments, names: list[str], policy: DampingPolicy, options: 
 
     problems = [_one_of_several(args, name) for name in names] or None
     common.prepare_process(untraced=True)
-    columns = TextColumn("compiling programs"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("compiling programs"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=common.console()) as bar:
         task = bar.add_task("", total=None)
 
@@ -411,14 +451,17 @@ def _is_divided(args: Arguments) -> bool:
 
 
 def _checked(args: Arguments) -> tuple[str | None, Survey]:
-    """The path of the problem, and the problem with what the options say of it, after all checks of files; the first
-    process does this for all."""
+    """The path of the problem, and the problem with what the options say of it, after all checks of
+    files; the first process does this for all."""
     path = _path(args.problem)
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")
     outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
     outputs |= {"--survey": args.survey, "--checkpoint": args.checkpoint}
-    read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
+    read = {
+        "the file of --constraints": args.constraints,
+        "the file of --policy": policy_file(args.policy),
+    }
     check_outputs(args.output, outputs, path, read)
     if args.view:
         common.check_extra(view.VIEWER)
@@ -431,16 +474,25 @@ def _checked(args: Arguments) -> tuple[str | None, Survey]:
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and not problem.residuals:
-        raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
+        raise common.UsageError(
+            "--covariance needs --gauge, constants or priors: position and scale are free"
+        )
     return path, survey
 
 
 def _constrained(args: Arguments, path: str | None) -> Survey:
     """A problem with what is constant or measured; without a path the built-in scene."""
     problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
-    found = surveyed(problem, args.constant, args.gauge, args.constraints, strict=args.strict, path=path)
-    whole = np.sum(np.asarray(found.problem.point_index) < problem.num_points) == problem.num_observations
-    common.require(bool(whole) or not args.reject, "--reject is for all observations, not for a part")
+    found = surveyed(
+        problem, args.constant, args.gauge, args.constraints, strict=args.strict, path=path
+    )
+    whole = (
+        np.sum(np.asarray(found.problem.point_index) < problem.num_points)
+        == problem.num_observations
+    )
+    common.require(
+        bool(whole) or not args.reject, "--reject is for all observations, not for a part"
+    )
     return found
 
 
@@ -474,7 +526,9 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss, points: int
     with common.notes_printed():
         found = covariance(problem, loss=loss)
     names = ("poses", "lenses", "points", "points_given_cameras")
-    arrays: dict[str, Any] = {name: getattr(found, name) for name in names} | {"axes": np.array(AXES)}
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in names} | {
+        "axes": np.array(AXES)
+    }
     if (labels := problem.labels) is not None:
         ids = {"image_names": np.array(labels.names), "image_ids": labels.images}
         arrays |= ids | {"camera_ids": labels.lenses, "point_ids": labels.points}
@@ -487,8 +541,13 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss, points: int
 def _check_checkpoint(args: Arguments) -> None:
     """Raises UsageError: a checkpoint of more than one solve."""
     names = ("recipes", "retriangulate", "reject", "resume", "processes", "distributed")
-    several = [f"--{name}" for name in names if getattr(args, name)] + ["several problems"] * bool(args.more)
-    common.require(not (args.checkpoint and several), f"--checkpoint is for one solve, not for {', '.join(several)}")
+    several = [f"--{name}" for name in names if getattr(args, name)] + ["several problems"] * bool(
+        args.more
+    )
+    common.require(
+        not (args.checkpoint and several),
+        f"--checkpoint is for one solve, not for {', '.join(several)}",
+    )
 
 
 def _check_recipes(args: Arguments) -> None:
@@ -498,13 +557,24 @@ def _check_recipes(args: Arguments) -> None:
     from jaxba.solver.recipes import RECIPES
 
     common.require(2 <= args.recipes <= len(RECIPES), f"--recipes must be 2 to {len(RECIPES)}")
-    others = {f"--{name}": getattr(args, name) for name in ("record", "view", "log", "retriangulate", "reject")}
-    given = [name for name, value in {**others, "--devices and --processes": _is_divided(args)}.items() if value]
+    others = {
+        f"--{name}": getattr(args, name)
+        for name in ("record", "view", "log", "retriangulate", "reject")
+    }
+    given = [
+        name
+        for name, value in {**others, "--devices and --processes": _is_divided(args)}.items()
+        if value
+    ]
     common.require(not given, f"{', '.join(given)}: for one policy, not for --recipes")
 
 
 def _by_recipes(
-    args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions, watch: Watch | None
+    args: Arguments,
+    problem: BundleProblem,
+    policy: DampingPolicy,
+    options: SolveOptions,
+    watch: Watch | None,
 ) -> tuple[Solution, list[IterationRecord]]:
     """Solves by several policies, and prints the end of each; the lowest one is the solution."""
     from jaxba.solver.recipes import RECIPES, solve_recipes
@@ -512,12 +582,18 @@ def _by_recipes(
     with common.notes_printed():
         found = solve_recipes(problem, args.recipes or 1, policy, options)
     for name, one in zip((args.policy, *RECIPES[1:]), found, strict=False):
-        common.print_line(f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}")
+        common.print_line(
+            f"{name}: cost {one.final_cost:.6e} after {common.counted(one.iterations, 'iteration')}"
+        )
     return min(found, key=lambda one: one.final_cost), []
 
 
 def _iterate(
-    args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions, watch: Watch | None
+    args: Arguments,
+    problem: BundleProblem,
+    policy: DampingPolicy,
+    options: SolveOptions,
+    watch: Watch | None,
 ) -> tuple[Solution, list[IterationRecord]]:
     """Solves, and prints every iteration. The first Ctrl-C stops after the current iteration."""
     steps: list[IterationRecord] = []
@@ -538,4 +614,6 @@ def _iterate(
         from jaxba.results.alternation import solve_and_retriangulate
 
         show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))
-        return solve_and_retriangulate(problem, policy, options, on_search=show_search, **hooks), steps
+        return solve_and_retriangulate(
+            problem, policy, options, on_search=show_search, **hooks
+        ), steps

@@ -1,4 +1,5 @@
-"""Standard output and error that outlive their readers: `jaxba-bench --help | head`, a terminal that is gone."""
+"""Standard output and error that outlive their readers: `jaxba-bench --help | head`, a terminal
+that is gone."""
 
 from __future__ import annotations
 
@@ -14,14 +15,16 @@ from typing import Any
 
 
 class UnwritableStreamError(Exception):
-    """Standard output cannot be written, though its reader is there. No `OSError`, which would be one of a file."""
+    """Standard output cannot be written, though its reader is there. No `OSError`, which would be
+    one of a file."""
 
 
 class TolerantStream:
     """A text stream that, once its reader has closed it, discards what is written."""
 
     def __init__(self, stream: Any, *, discard_all: bool) -> None:
-        """`discard_all`: after any other error, too, instead of raising an `UnwritableStreamError`."""
+        """`discard_all`: after any other error, too, instead of raising an
+        `UnwritableStreamError`."""
         self._stream, self._discard_all = stream, discard_all
 
     def __getattr__(self, name: str) -> Any:
@@ -48,15 +51,16 @@ class TolerantStream:
         try:
             yield
         except OSError as error:
-            with suppress(OSError, ValueError):  # a stream without a file; what it has buffered is discarded, too
+            # a stream without a file; what it has buffered is discarded, too
+            with suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
             if not (self._discard_all or isinstance(error, BrokenPipeError)):
                 raise UnwritableStreamError(f"standard output: {error.strerror or error}") from None
 
 
 def whole_input() -> str:
-    """A path from which standard input can be read, more than once: all that comes through a pipe is kept first. Raises
-    OSError: there is none, or it cannot be kept."""
+    """A path from which standard input can be read, more than once: all that comes through a pipe
+    is kept first. Raises OSError: there is none, or it cannot be kept."""
     if not stat.S_ISREG(os.fstat(0).st_mode):
         with tempfile.TemporaryFile() as copy, open(0, "rb", closefd=False) as given:
             shutil.copyfileobj(given, copy)
@@ -68,14 +72,16 @@ def whole_input() -> str:
 
 @contextmanager
 def tolerant_streams() -> Iterator[None]:
-    """A context in which standard output and error are tolerant, and escape characters that their encoding lacks, which
-    file names may have, instead of raising an error."""
+    """A context in which standard output and error are tolerant, and escape characters that their
+    encoding lacks, which file names may have, instead of raising an error."""
     before = sys.stdout, sys.stderr
     for stream in before:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     with open(os.devnull, "w") as nothing:  # for streams that were closed from the start
-        wrap = lambda stream, discard_all: TolerantStream(stream or nothing, discard_all=discard_all)
+        wrap = lambda stream, discard_all: TolerantStream(
+            stream or nothing, discard_all=discard_all
+        )
         sys.stdout, sys.stderr = wrap(before[0], False), wrap(before[1], True)
         try:
             yield

@@ -1,4 +1,5 @@
-"""Text that `jaxba-solve` prints around the table of iterations (solver/progress.py): a heading and a summary."""
+"""Text that `jaxba-solve` prints around the table of iterations (solver/progress.py): a heading and
+a summary."""
 
 from __future__ import annotations
 
@@ -38,11 +39,22 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         ", distortion per pixel": coordinates.lens_step == "pixels",
     }
     refine = "".join(text for text, present in parts.items() if present)
-    solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
-    counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
+    solver = (
+        f"linear solver {args.linear_solver}"
+        if args.method == DEFAULT_METHOD
+        else f"method {args.method}"
+    )
+    counts = (
+        ("camera", problem.num_cameras),
+        ("point", problem.num_points),
+        ("observation", problem.num_observations),
+    )
     sizes = ", ".join(counted(count, noun) for noun, count in counts)
     sizes += "".join(f", {part}" for part in [*_lenses(problem, options), *_constants(problem)])
-    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, {solver}"
+    return (
+        f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, "
+        f"{solver}"
+    )
 
 
 def _lenses(problem: BundleProblem, options: StepOptions) -> Iterator[str]:
@@ -53,7 +65,10 @@ def _lenses(problem: BundleProblem, options: StepOptions) -> Iterator[str]:
     free = np.asarray(lenses.free) & (options.intrinsics == "free")
     kinds = ((lenses.model_of(lens), tuple(row)) for lens, row in enumerate(free.tolist()))
     for (model, moves), number in Counter(kinds).most_common():
-        names = ", ".join(name for name, moved in zip(model.parameters, moves, strict=False) if moved) or "constant"
+        names = (
+            ", ".join(name for name, moved in zip(model.parameters, moves, strict=False) if moved)
+            or "constant"
+        )
         name = "lens" + "es" * (number > 1) if lenses.all_bal else model.name
         yield f"{number} {name} ({names})"
 
@@ -79,26 +94,41 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 
 
 def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
-    """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
+    """The result of a solve in a few lines. `loss` is that of the solve; None: squared
+    residuals."""
     state = "converged" if solution.converged else "not converged"
     left_out, notes = rejected(solution), solution.notes
     sizes = solution.num_residuals, solution.num_parameters
     if solution.rejected is None:
-        problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
+        problem, end = (
+            without_views_of(p, solution.set_aside) for p in (problem, solution.problem)
+        )
     else:
         problem, end = (p.subset(~solution.rejected) for p in (problem, solution.problem))
     solution = replace(solution, problem=end)
     costs = [solution.initial_cost, solution.final_cost]
-    if problem.residuals or not (loss or Loss()).trivial:  # else the residuals' own, in the solve's arithmetic
+    # else the residuals' own, in the solve's arithmetic
+    if problem.residuals or not (loss or Loss()).trivial:
         costs = [geometry.cost(p) for p in (problem, solution.problem)]
     rms = [np.sqrt(2 * cost / problem.num_observations) for cost in costs]
     # a robust loss may bear a residual that overflows
     shown = f" (rms {rms[0]:.4g} -> {rms[1]:.4g} px)" if np.isfinite(rms).all() else ""
     # COLMAP prints the root of the cost over the number of residuals
-    colmaps = [np.sqrt(cost / (2 * problem.num_observations)) for cost in (solution.initial_cost, solution.final_cost)]
-    as_colmap = f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px" if problem.labels is not None else ""
+    colmaps = [
+        np.sqrt(cost / (2 * problem.num_observations))
+        for cost in (solution.initial_cost, solution.final_cost)
+    ]
+    as_colmap = (
+        f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px"
+        if problem.labels is not None
+        else ""
+    )
     kinds = solution.costs.items() if problem.residuals else ()
-    by_kind = [f"of it at the end: {', '.join(f'{name} {cost:.6e}' for name, cost in kinds)}"] if kinds else []
+    by_kind = (
+        [f"of it at the end: {', '.join(f'{name} {cost:.6e}' for name, cost in kinds)}"]
+        if kinds
+        else []
+    )
     distance = solution.distance
     left = f"; estimated within {distance:.1e} of the end" if math.isfinite(distance) else ""
     misfits = [f"note: {note}" for note in notes]
@@ -125,7 +155,10 @@ def rejected(solution: Solution) -> list[str]:
         for mask in (solution.rejected, slice(None))
     )
     worst = np.argsort(-gone / np.maximum(views, 1), kind="stable")[: np.count_nonzero(gone)]
-    named = [f"{part_name(problem.labels, 'image', at)} {gone[at]} of {views[at]}" for at in worst[:NAMED]]
+    named = [
+        f"{part_name(problem.labels, 'image', at)} {gone[at]} of {views[at]}"
+        for at in worst[:NAMED]
+    ]
     more = f" and {counted(len(worst) - NAMED, 'more image')}" if len(worst) > NAMED else ""
     by_image = f": {', '.join(named)}{more}" if named else ""
     lost = part_names(problem.labels, "image", solution.set_aside, NAMED)
@@ -134,23 +167,29 @@ def rejected(solution: Solution) -> list[str]:
 
 
 def without_weight(solution: Solution, loss: Loss) -> list[str]:
-    """A note on observations that the loss ignored at the end, with what to do if those are most of them."""
+    """A note on observations that the loss ignored at the end, with what to do if those are most of
+    them."""
     if loss.rho != "tukey":
         return []
     norms = np.linalg.norm(geometry.residuals(solution.problem), axis=1)
     beyond = int(np.sum(norms >= loss.scale))
     if not beyond:
         return []
-    line = f"note: {counted(beyond, 'observation')} of {len(norms)} beyond --loss-scale {loss.scale:g} px had no weight"
+    line = (
+        f"note: {counted(beyond, 'observation')} of {len(norms)} beyond --loss-scale "
+        f"{loss.scale:g} px had no weight"
+    )
     if 2 * beyond < len(norms):
         return [line]
     return [
-        f"{line}: choose a larger one (half of the residuals lie above {np.median(norms):.3g} px), or another --loss"
+        f"{line}: choose a larger one (half of the residuals lie above {np.median(norms):.3g} px), "
+        "or another --loss"
     ]
 
 
 def _how_compiled(solution: Solution) -> str:
-    """A note on iterations with quickly compiled programs, which are slower; empty if there were none."""
+    """A note on iterations with quickly compiled programs, which are slower; empty if there were
+    none."""
     quick = solution.quick_iterations
     if not quick:
         return ""
@@ -159,11 +198,13 @@ def _how_compiled(solution: Solution) -> str:
 
 
 def lost_in(problem: BundleProblem, model: bool) -> str:
-    """What a new COLMAP model, or else a BAL or Bundler file, cannot store of a problem, as text; may be empty."""
+    """What a new COLMAP model, or else a BAL or Bundler file, cannot store of a problem, as text;
+    may be empty."""
     lenses = problem.lenses
     lost = {
         "which images share a lens": not model and lenses is not None and lenses.shared,
-        "which numbers of a lens are constant": lenses is not None and not np.asarray(lenses.free).all(),
+        "which numbers of a lens are constant": lenses is not None
+        and not np.asarray(lenses.free).all(),
         "which poses and points are constant": problem.constants is not None,
         "rigs": problem.rigs is not None,
         "priors and other residuals": bool(problem.residuals),
@@ -173,7 +214,8 @@ def lost_in(problem: BundleProblem, model: bool) -> str:
 
 
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
-    """Notes on what has no observations, on points with one, and behind cameras. Other residuals' rows count too."""
+    """Notes on what has no observations, on points with one, and behind cameras. Other residuals'
+    rows count too."""
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     for own in (own for rows in problem.residuals.rows for own in rows.points):
         points += np.bincount(own[own >= 0], minlength=problem.num_points)
@@ -194,11 +236,18 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     ]
     lines = [f"note: {counted(count, noun)} {text}" for count, noun, text in found if count]
     if before.any() or after.any():
-        of_image = np.bincount(problem.camera_index[after if after.any() else before], minlength=problem.num_cameras)
+        of_image = np.bincount(
+            problem.camera_index[after if after.any() else before], minlength=problem.num_cameras
+        )
         most = np.argsort(-of_image, kind="stable")[: np.count_nonzero(of_image)]
-        why = ": is the scene mirrored, or of another convention?" if 2 * np.sum(before) > len(before) else ""
+        why = (
+            ": is the scene mirrored, or of another convention?"
+            if 2 * np.sum(before) > len(before)
+            else ""
+        )
         lines.append(
-            f"note: observations behind their camera: {np.sum(before)} at the start, {np.sum(after)} at the end "
+            f"note: observations behind their camera: {np.sum(before)} at the start, "
+            f"{np.sum(after)} at the end "
             f"(most of {part_names(problem.labels, 'image', most, NAMED)}){why}"
         )
     return lines

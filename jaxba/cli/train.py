@@ -29,28 +29,31 @@ class Arguments:
     """What is trained, and where."""
 
     config: Annotated[str | None, "NAME"] = None
-    """Preset (default, paper, paper-tuned) or YAML file. A resumed run has its configuration in its folder."""
+    """Preset (default, paper, paper-tuned) or YAML file. A resumed run has its configuration in its
+    folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...],
         tyro.conf.UseAppendAction,
         tyro.conf.arg(name="set", metavar="KEY=VALUE ...", prefix_name=False),
     ] = ()
-    """Settings that replace those of the configuration, such as sac.width=128 seed=3; values are YAML."""
+    """Settings that replace those of the configuration, such as sac.width=128 seed=3; values are
+    YAML."""
 
     out: Annotated[str | None, "FOLDER"] = None
     """Folder of the run. Default: runs/NAME for the configuration NAME."""
 
     seeds: int | None = None
-    """Agents that are trained side by side from other random numbers. Each has a policy file; the one that is best on
-    training scenes is written once more."""
+    """Agents that are trained side by side from other random numbers. Each has a policy file; the
+    one that is best on training scenes is written once more."""
 
     problems: Annotated[tuple[str, ...], "FILE ..."] = ()
-    """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are windows of neighbouring
-    cameras; the last fifth of every problem is held out."""
+    """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are
+    windows of neighbouring cameras; the last fifth of every problem is held out."""
 
     resume: bool = False
-    """Continue the run in the folder from its last checkpoint: the same results as without interruption, bit by bit."""
+    """Continue the run in the folder from its last checkpoint: the same results as without
+    interruption, bit by bit."""
 
 
 def main() -> None:
@@ -59,7 +62,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 for a policy, 2 for bad input, 130 after Ctrl-C (the run is saved)."""
+    """Runs the command. Exit status: 0 for a policy, 2 for bad input, 130 after Ctrl-C (the run is
+    saved)."""
     command = common.command_line("jaxba-train", argv)
     train = functools.partial(_train, command=command)
     return common.run_command(Arguments, train, "Trains a damping policy on random scenes.", argv)
@@ -100,7 +104,8 @@ def _train(args: Arguments, command: str) -> int:
     with process.single_blas_thread(), Interrupt("chunk", graceful=False) as interrupt:
         stages = _Stages(console)
         try:
-            with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
+            # they were printed when the problems were checked
+            with common.notes_printed(lambda _: None):
                 loops: list[Any] = []
                 compiling = lambda game: loops.append(driver.begin_compiling(config, game))
                 work = task.build(config, folder, stages, on_game=compiling)
@@ -116,10 +121,17 @@ def _train(args: Arguments, command: str) -> int:
                 agent = config.game.agent
                 decades, row = (agent.high - agent.low) / 2, rows[0]
                 if not began:
-                    began.append((time.perf_counter() - row["chunk_s"] - row.get("evaluate_s", 0.0), row["chunk"] - 1))
+                    began.append(
+                        (
+                            time.perf_counter() - row["chunk_s"] - row.get("evaluate_s", 0.0),
+                            row["chunk"] - 1,
+                        )
+                    )
                 mean = (time.perf_counter() - began[0][0]) / (row["chunk"] - began[0][1])
                 left = mean * (config.chunks - row["chunk"])
-                for line in view.lines(rows, config.chunks, work.rules, row["chunk"] in best, decades, left):
+                for line in view.lines(
+                    rows, config.chunks, work.rules, row["chunk"] in best, decades, left
+                ):
                     console.print(line)
 
             hooks = driver.Hooks(stages, show, keep, lambda: interrupt.requested, console.print)
@@ -130,7 +142,8 @@ def _train(args: Arguments, command: str) -> int:
             return common.INTERRUPTED
         except OSError as error:
             raise common.UsageError(
-                f"{error.filename or folder}: {error.strerror or error}; go on with {_again(folder)}"
+                f"{error.filename or folder}: {error.strerror or error}; go on with "
+                f"{_again(folder)}"
             ) from None
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
@@ -152,7 +165,8 @@ class _Stages:
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:
-    """The paths of the problems, once they were read, so that a bad one is refused before anything is written."""
+    """The paths of the problems, once they were read, so that a bad one is refused before anything
+    is written."""
     from jaxba.datasets.bal.paths import resolve
     from jaxba.game.windows import read_all
 
@@ -167,7 +181,8 @@ def _again(folder: Path) -> str:
 
 
 def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -> list[Path]:
-    """Writes the policy of every agent if there are several, and that of the best agent; the files."""
+    """Writes the policy of every agent if there are several, and that of the best agent; the
+    files."""
     from jaxba import __version__
     from jaxba.damping.policy_file import save_policy
     from jaxba.settings import to_yaml
@@ -188,7 +203,12 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
 
 
 def _finish(
-    folder: Path, work: Any, best: Sequence[Any], console: Any, command: str, stages: Callable[[str], None]
+    folder: Path,
+    work: Any,
+    best: Sequence[Any],
+    console: Any,
+    command: str,
+    stages: Callable[[str], None],
 ) -> int:
     """Writes the policies and the page, and prints the comparison with the rules."""
     from jaxba.bench import run as bench_run
@@ -221,7 +241,8 @@ def _finish(
 
 
 def _table(compared: Any, tolerance: float, count: int) -> Table:
-    """Scores on the held-out scenes, and the iterations of the trained policies over those of each other row."""
+    """Scores on the held-out scenes, and the iterations of the trained policies over those of each
+    other row."""
     from jaxba.bench.tables import Table
 
     scores, ratios, by_agent = compared
@@ -239,5 +260,6 @@ def _table(compared: Any, tolerance: float, count: int) -> Table:
         f"Iterations to f*(1 + {tolerance:g}) on {count} held-out scenes",
         (*header, *single, "trained over it [95%]"),
         rows,
-        "A failure counts as the limit. The last column: iterations of the trained policies over this one's, by scene.",
+        "A failure counts as the limit. The last column: iterations of the trained policies over "
+        "this one's, by scene.",
     )

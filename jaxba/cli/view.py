@@ -1,4 +1,5 @@
-"""`jaxba-view`, and `--record` and `--view` of `jaxba-solve`: problems and solves in the browser, also running ones."""
+"""`jaxba-view`, and `--record` and `--view` of `jaxba-solve`: problems and solves in the browser,
+also running ones."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ class Arguments:
     """Options of `jaxba-view`."""
 
     files: Annotated[tuple[str, ...], "FILE ...", tyro.conf.Positional]
-    """Problems in any format of jaxba-solve, and recordings of jaxba-solve --record, side by side."""
+    """Problems in any format of jaxba-solve, and recordings of jaxba-solve --record, side by
+    side."""
 
     images: Annotated[str | None, "FOLDER"] = None
     """Images, for files that name them (COLMAP, jaxba-kitti)."""
@@ -40,7 +42,8 @@ class Arguments:
     """Write one page that opens without a server and plays the iterations. Nothing is served."""
 
     host: Annotated[str, "ADDRESS"] = "127.0.0.1"
-    """Address at which the page is served, without a password; 0.0.0.0 for every machine that reaches this one."""
+    """Address at which the page is served, without a password; 0.0.0.0 for every machine that
+    reaches this one."""
 
 
 def main() -> None:
@@ -50,12 +53,16 @@ def main() -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0, or 2 for bad input."""
-    return common.run_command(Arguments, _run, "Look at problems and recorded solves in the browser.", argv)
+    return common.run_command(
+        Arguments, _run, "Look at problems and recorded solves in the browser.", argv
+    )
 
 
 def _run(args: Arguments) -> int:
     common.require(bool(args.files), "name a problem or a recording")
-    common.require(args.images is None or os.path.isdir(args.images), f"--images {args.images}: is no folder")
+    common.require(
+        args.images is None or os.path.isdir(args.images), f"--images {args.images}: is no folder"
+    )
     _check_host(args.host)
     common.check_writable("--html", args.html)
     _check_apart(args)
@@ -87,7 +94,9 @@ def _check_host(host: str) -> None:
         with socket.socket(family, kind) as server:
             server.bind(place)
     except (OSError, UnicodeError) as error:
-        raise common.UsageError(f"--host {host}: {getattr(error, 'strerror', None) or error}") from None
+        raise common.UsageError(
+            f"--host {host}: {getattr(error, 'strerror', None) or error}"
+        ) from None
 
 
 def _check_apart(args: Arguments) -> None:
@@ -98,14 +107,22 @@ def _check_apart(args: Arguments) -> None:
     from jaxba.datasets.bal.paths import resolve
 
     files = [file for name in args.files for file in problem_files(resolve(name))]
-    images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
+    images = (
+        []
+        if args.images is None
+        else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
+    )
     check_apart({"--html": [args.html]}, {PROBLEM: files, "an image": images})
 
 
 def announce(viewer: Viewer) -> None:
     """Prints where the page is, and opens it where there is a display."""
     common.print_line(f"open {viewer.url}")
-    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if (
+        sys.platform in ("darwin", "win32")
+        or os.environ.get("DISPLAY")
+        or os.environ.get("WAYLAND_DISPLAY")
+    ):
         webbrowser.open(viewer.url)
 
 
@@ -121,8 +138,9 @@ def wait(viewer: Viewer) -> None:
 def watched(
     problem: BundleProblem, path: str | None, record: str | None, show: bool
 ) -> tuple[Watch | None, Callable[[], None]]:
-    """Opens the page if `show`, for a problem that was read at `path`; `record` is the file of the recording, if one is
-    wanted. Returns `watch` for `jaxba.solve`, and what writes the recording and serves the page after it."""
+    """Opens the page if `show`, for a problem that was read at `path`; `record` is the file of the
+    recording, if one is wanted. Returns `watch` for `jaxba.solve`, and what writes the recording
+    and serves the page after it."""
     if record is None and not show:
         return None, lambda: None
     from jaxba.viewer.recording import Recorder, write_recording

@@ -1,4 +1,5 @@
-"""What a file of constraints says of ground control points: places of points, and pixels where images show them."""
+"""What a file of constraints says of ground control points: places of points, and pixels where
+images show them."""
 
 from __future__ import annotations
 
@@ -35,10 +36,16 @@ OPTIONS = ("check", "pixels", "crs", "stddev", "loss", "loss_scale", "align")  #
 
 
 def with_control_points(
-    problem: BundleProblem, where: str, value: Any, strict: bool, frame: Frame | None, model: StrPath | None
+    problem: BundleProblem,
+    where: str,
+    value: Any,
+    strict: bool,
+    frame: Frame | None,
+    model: StrPath | None,
 ) -> tuple[BundleProblem, Marks]:
-    """The problem of a COLMAP model with the marks of a file, at places in the frame of the scene, which is moved there
-    unless something else was measured already; and the marks. The rest is as for `with_measured`."""
+    """The problem of a COLMAP model with the marks of a file, at places in the frame of the scene,
+    which is moved there unless something else was measured already; and the marks. The rest is as
+    for `with_measured`."""
     values.parse_mapping(value, ["file"], OPTIONS)
     labels = problem.labels
     if labels is None or (every_lens(problem).all_bal and model is None):
@@ -81,7 +88,9 @@ def _check_names(value: dict[str, Any], names: list[str]) -> list[str]:
     checks = values.parse_items(value.get("check", []), "names")
     unknown = [name for name in checks if name not in names]
     if unknown:
-        raise ValueError(f"check: there is no point {unknown[0]}; there are {values.names_of(names)}")
+        raise ValueError(
+            f"check: there is no point {unknown[0]}; there are {values.names_of(names)}"
+        )
     return checks
 
 
@@ -124,8 +133,8 @@ def _clicks(
 def _usable_points(
     where: str, points: ControlPoints, clicks: Clicks, crs: str, strict: bool
 ) -> Int[np.ndarray, " used"]:
-    """Which points have a place, and pixels in two images or more. Others are left out with a note. Raises ValueError:
-    none is usable, or one is left out and `strict`; one line."""
+    """Which points have a place, and pixels in two images or more. Others are left out with a note.
+    Raises ValueError: none is usable, or one is left out and `strict`; one line."""
     placed = has_fix(points.places, crs != "" and is_geographic(crs))
     images = np.bincount(clicks.mark, minlength=len(points.names))
     used = np.flatnonzero(placed & (images > 1))
@@ -149,7 +158,8 @@ def _places_in_scene(
     frame: Frame | None,
     align: bool,
 ) -> Float[np.ndarray, "points 3"]:
-    """Places in the frame of the scene, with a note that says which one it gets; NaN where nothing moves it there.
+    """Places in the frame of the scene, with a note that says which one it gets; NaN where nothing
+    moves it there.
 
     Args:
         problem: the problem, with residuals if something else was measured.
@@ -161,10 +171,20 @@ def _places_in_scene(
         align: whether the scene is moved to the control points."""
     alone = check.all() and not problem.residuals
     if alone and crs and align:
-        report([f"{where}: all are check points and there are no position_priors: nothing moves the scene to {crs}"])
+        report(
+            [
+                f"{where}: all are check points and there are no position_priors: nothing moves "
+                f"the scene to {crs}"
+            ]
+        )
         return np.full_like(places, np.nan)
     if alone:
-        report([f"{where}: all are check points, and nothing moves the scene: it is taken to be in their frame"])
+        report(
+            [
+                f"{where}: all are check points, and nothing moves the scene: it is taken to be in "
+                "their frame"
+            ]
+        )
     if not crs:
         return places
     origin_of = places if check.all() else places[~check]
@@ -177,8 +197,8 @@ def _places_in_scene(
 def _observations_of(
     problem: BundleProblem, labels: Labels, clicks: Clicks, model: StrPath | None
 ) -> Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]:
-    """What makes observations of the problem of pixels, one for each click: those of BAL's lenses are from the
-    principal point, y up."""
+    """What makes observations of the problem of pixels, one for each click: those of BAL's lenses
+    are from the principal point, y up."""
     if model is None or not every_lens(problem).all_bal:
         return np.asarray
     origins = principal_points(model, labels.images.tolist())[clicks.image]
@@ -194,13 +214,17 @@ def _where_rays_meet(problem: BundleProblem, count: int) -> BundleProblem:
     first = problem.num_points - count
     alone = np.asarray(problem.point_index) >= first
     seen = np.unique(np.asarray(problem.camera_index)[alone])
-    met = retriangulate(problem.subset(alone, seen, np.arange(first, problem.num_points))).problem.points
+    met = retriangulate(
+        problem.subset(alone, seen, np.arange(first, problem.num_points))
+    ).problem.points
     return problem.replace(points=np.concatenate([np.asarray(problem.points)[:first], met]))
 
 
-def _on_marks(problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> tuple[BundleProblem, list[str]]:
-    """The problem with rows of the control points among its marks, moved to these if nothing else placed it, and what
-    does not fit before the solve, if `align`. The marks are its last points."""
+def _on_marks(
+    problem: BundleProblem, marks: Marks, loss: Loss, align: bool
+) -> tuple[BundleProblem, list[str]]:
+    """The problem with rows of the control points among its marks, moved to these if nothing else
+    placed it, and what does not fit before the solve, if `align`. The marks are its last points."""
     first = problem.num_points - len(marks.names)
     control = np.flatnonzero(~marks.check)
     met = np.asarray(problem.points)[first:]
@@ -214,10 +238,14 @@ def _on_marks(problem: BundleProblem, marks: Marks, loss: Loss, align: bool) -> 
         problem = transformed(problem, fit)
         away = fit.points(met[control]) - marks.places[control]
         names = [marks.names[at] for at in control]
-        notes += misfit_texts(names.__getitem__, "points", away, marks.places[control], covariances[control], chi)
+        notes += misfit_texts(
+            names.__getitem__, "points", away, marks.places[control], covariances[control], chi
+        )
         notes += [ON_ITS_HEAD] if planar and on_its_head(problem) else []
     if not len(control):
         return problem, notes
     whitening = np.eye(3) / marks.stddev[control][:, None]
-    rows = residuals.control_point(point=first + control, position=marks.places[control], whitening=whitening)
+    rows = residuals.control_point(
+        point=first + control, position=marks.places[control], whitening=whitening
+    )
     return with_residual(problem, replace(rows, aligned=True), loss=loss), notes

@@ -1,4 +1,5 @@
-"""Depths of maps at the pixels of a problem, and what maps cannot be: of another shape, on their side, disparities."""
+"""Depths of maps at the pixels of a problem, and what maps cannot be: of another shape, on their
+side, disparities."""
 
 from __future__ import annotations
 
@@ -15,16 +16,19 @@ from jaxba.problem.geometry import COLMAP_FLIP
 from jaxba.problem.hold import every_lens
 
 ROUNDED = 32
-"""Sides of a map are those of its image, times a scale, to half of this: networks take multiples of up to 32 pixels.
-Source: Ranftl et al. 2021, "Vision Transformers for Dense Prediction", section 4."""
+"""Sides of a map are those of its image, times a scale, to half of this: networks take multiples of
+up to 32 pixels. Source: Ranftl et al. 2021, "Vision Transformers for Dense Prediction", section
+4."""
 
-COVERED = 0.4  # share of the pixels of an image of unknown size that lie in its map: in one of half size a quarter do
+# share of the pixels of an image of unknown size that lie in its map: in one of half size a quarter
+# do
+COVERED = 0.4
 
 LEAST_PIXELS = 8  # of an image whose depths are compared
 
 OPPOSITE = -0.5
-"""Rank correlation of depths and a map, the mean over images, below which it has disparities: without noise that of
-depths is 1, of disparities -1, and of neither 0."""
+"""Rank correlation of depths and a map, the mean over images, below which it has disparities:
+without noise that of depths is 1, of disparities -1, and of neither 0."""
 
 
 class Placed(NamedTuple):
@@ -36,7 +40,8 @@ class Placed(NamedTuple):
 
 
 def pixels_of_images(problem: BundleProblem, model: StrPath | None) -> Placed:
-    """Where observations are in their images, by the COLMAP model of the problem if there is one."""
+    """Where observations are in their images, by the COLMAP model of the problem if there is
+    one."""
     pixels = np.asarray(problem.observations, np.float64)
     camera = np.asarray(problem.camera_index)
     bal = every_lens(problem).all_bal
@@ -50,7 +55,9 @@ def pixels_of_images(problem: BundleProblem, model: StrPath | None) -> Placed:
     return Placed(pixels, image_sizes(model, images), False)
 
 
-def looked_up(file: Path, placed: Placed, own: Int[np.ndarray, " n"], image: int) -> Float[np.ndarray, " n"]:
+def looked_up(
+    file: Path, placed: Placed, own: Int[np.ndarray, " n"], image: int
+) -> Float[np.ndarray, " n"]:
     """Depths of a map at pixels of its image, NaN where there is none.
 
     Args:
@@ -74,13 +81,18 @@ def looked_up(file: Path, placed: Placed, own: Int[np.ndarray, " n"], image: int
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     if np.mean(inside) < COVERED and not (placed.sizes[image] > 0).all():
         outside = f"{np.sum(~inside)} of {len(own)} pixels of its image lie outside"
-        raise ValueError(f"{file}: is {width} x {height}, and {outside}: maps have the size of their images")
+        raise ValueError(
+            f"{file}: is {width} x {height}, and {outside}: maps have the size of their images"
+        )
     depth = depths[np.where(inside, row, 0), np.where(inside, column, 0)]
     return np.where(inside & (depth > 0) & np.isfinite(depth), depth, np.nan)
 
 
-def _scale(file: Path, size: Float[np.ndarray, "2"], of_image: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Size of a map over that of its image, along x and y. Raises ValueError: they are not of one shape; one line."""
+def _scale(
+    file: Path, size: Float[np.ndarray, "2"], of_image: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "2"]:
+    """Size of a map over that of its image, along x and y. Raises ValueError: they are not of one
+    shape; one line."""
     if _same_shape(size, of_image):
         return size / of_image
     both = f"is {size[0]:g} x {size[1]:g}, and its image {of_image[0]:g} x {of_image[1]:g}"
@@ -113,11 +125,18 @@ def refuse_disparities(
     correlations = []
     for number in range(int(image.max()) + 1):
         of_image = image == number
-        if of_image.sum() >= LEAST_PIXELS and np.ptp(measured[of_image]) > 0 and np.ptp(depths[of_image]) > 0:
-            correlations.append(float(np.corrcoef(rankdata(measured[of_image]), rankdata(depths[of_image]))[0, 1]))
+        if (
+            of_image.sum() >= LEAST_PIXELS
+            and np.ptp(measured[of_image]) > 0
+            and np.ptp(depths[of_image]) > 0
+        ):
+            correlations.append(
+                float(np.corrcoef(rankdata(measured[of_image]), rankdata(depths[of_image]))[0, 1])
+            )
     mean = float(np.mean(correlations)) if correlations else 0.0
     if mean < OPPOSITE:
         raise ValueError(
-            f"{folder}: maps are smaller where points are farther (rank correlation {mean:.2f}): they seem "
+            f"{folder}: maps are smaller where points are farther (rank correlation {mean:.2f}): "
+            "they seem "
             "to have disparities, not depths; give their inverse"
         )

@@ -52,7 +52,8 @@ Constraints = StrPath | Mapping[str, Any]
 
 
 class ConstraintError(ProblemError):
-    """Constraints that cannot be used. The message is one line that begins with their file and key."""
+    """Constraints that cannot be used. The message is one line that begins with their file and
+    key."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,32 +67,45 @@ class Survey(ArrayRecord):
     """These marks."""
 
     def report(self, solution: Solution) -> Report:
-        """What a solve of the problem made of control points, check points and distances, and what does not fit."""
+        """What a solve of the problem made of control points, check points and distances, and what
+        does not fit."""
         problem, gone = solution.problem, solution.rejected
-        return report(problem if gone is None else problem.subset(~gone), self.marks, solution.notes)
+        return report(
+            problem if gone is None else problem.subset(~gone), self.marks, solution.notes
+        )
 
     def without_marks(self, solution: Solution) -> Solution:
         """A solution of the problem as of one without marks, such as is written."""
         if self.marks is None:
             return solution
-        own = np.asarray(solution.problem.point_index) < solution.problem.num_points - len(self.marks.names)
+        own = np.asarray(solution.problem.point_index) < solution.problem.num_points - len(
+            self.marks.names
+        )
         rejected = None if solution.rejected is None else solution.rejected[own]
         return replace(solution, problem=self.marks.without(solution.problem), rejected=rejected)
 
 
 def survey(
-    problem: BundleProblem, constraints: Constraints, *, model: StrPath | None = None, strict: bool = False
+    problem: BundleProblem,
+    constraints: Constraints,
+    *,
+    model: StrPath | None = None,
+    strict: bool = False,
 ) -> Survey:
-    """The problem with what a survey and other constraints say of it, as `jaxba-solve --constraints` has them.
+    """The problem with what a survey and other constraints say of it, as `jaxba-solve
+    --constraints` has them.
 
     Args:
         problem: any problem; of a COLMAP model, images have names, and all parts have ids.
-        constraints: a YAML file, or a mapping with its keys (how-to "Surveys" and "Constants and priors"). Files that
-            it names lie beside it, those of a mapping in the current folder.
-        model: the COLMAP model that the problem was read from, which a file of control points needs.
-        strict: refuse what is not in the problem, instead of leaving it out with a `ProblemWarning`.
+        constraints: a YAML file, or a mapping with its keys (how-to "Surveys" and "Constants and
+            priors"). Files that it names lie beside it, those of a mapping in the current folder.
+        model: the COLMAP model that the problem was read from, which a file of control points
+            needs.
+        strict: refuse what is not in the problem, instead of leaving it out with a
+            `ProblemWarning`.
 
-    Raises ProblemError: something is not in the problem, or not what its key takes; one line with file and key."""
+    Raises ProblemError: something is not in the problem, or not what its key takes; one line with
+        file and key."""
     found, gauge = constrained(problem, constraints, model=model, strict=strict)
     return replace(found, problem=with_gauge(found.problem, gauge))
 
@@ -104,7 +118,8 @@ def constrained(
     strict: bool,
     held: Callable[[BundleProblem], BundleProblem] = lambda problem: problem,
 ) -> tuple[Survey, Gauge]:
-    """`survey` without a gauge, and the gauge. `held` says what else is constant in the problem, once it is aligned."""
+    """`survey` without a gauge, and the gauge. `held` says what else is constant in the problem,
+    once it is aligned."""
     given = isinstance(constraints, Mapping)
     file = "constraints" if given else str(constraints)
     try:
@@ -112,26 +127,38 @@ def constrained(
     except SettingsError as error:
         raise ConstraintError(str(error)) from None
     if unknown := [key for key in settings if key not in KEYS]:
-        raise ConstraintError(f"{file}: unknown key {shown(unknown[0])}; there are {', '.join(KEYS)}")
+        raise ConstraintError(
+            f"{file}: unknown key {shown(unknown[0])}; there are {', '.join(KEYS)}"
+        )
     frame: Frame | None = None
     with _named(file, "crs"):
         if "crs" in settings:
             frame = projected(settings.pop("crs"))
     with _named(file, key := "position_priors"):
         if key in settings:  # the scene is aligned before anything is constant
-            problem, frame = with_positions(problem, f"{file}: {key}", settings.pop(key), strict, frame)
+            problem, frame = with_positions(
+                problem, f"{file}: {key}", settings.pop(key), strict, frame
+            )
     with _named(file, key := "control_points"):
         marks, value = None, settings.get(key)
         if isinstance(value, dict) and "file" in value:
-            problem, marks = with_control_points(problem, f"{file}: {key}", settings.pop(key), strict, frame, model)
+            problem, marks = with_control_points(
+                problem, f"{file}: {key}", settings.pop(key), strict, frame, model
+            )
     if frame is not None and frame.crs and marks is None and not problem.residuals:
-        note([f"{file}: crs: nothing moves the scene there: it needs position_priors or a file of control_points"])
+        note(
+            [
+                f"{file}: crs: nothing moves the scene there: it needs position_priors or a file "
+                "of control_points"
+            ]
+        )
     problem = held(problem)
     with _named(file, "gauge"):
         gauge = settings.pop("gauge", "free")
         if gauge not in get_args(Gauge):
             raise ValueError(f"must be one of {', '.join(get_args(Gauge))}, not {shown(gauge)}")
-    for key, value in sorted(settings.items(), key=lambda item: item[0] != "part"):  # it says what is seen
+    # it says what is seen
+    for key, value in sorted(settings.items(), key=lambda item: item[0] != "part"):
         with _named(file, key):
             problem = _apply(problem, f"{file}: {key}", key, value, strict, model)
     return Survey(problem, marks), gauge
@@ -163,7 +190,11 @@ def _apply(
         return with_measured(problem, where, key, value, strict, model)
     if key == "part":
         given = parse_mapping(value, (), tuple(OF_PART))
-        chosen = {name: _wanted(problem, kind, given[name], name) for name, kind in OF_PART.items() if name in given}
+        chosen = {
+            name: _wanted(problem, kind, given[name], name)
+            for name, kind in OF_PART.items()
+            if name in given
+        }
         return part(problem, **chosen)
     if key == "constant_numbers":
         return hold(problem, numbers=parse_items(value, KEYS[key]))
@@ -181,6 +212,8 @@ def _wanted(problem: BundleProblem, kind: Any, value: Any, what: str) -> Any:
     items = (
         value
         if value == "all"
-        else meant(parse_items(value, what), labels.names if labels is not None and kind == "image" else ())
+        else meant(
+            parse_items(value, what), labels.names if labels is not None and kind == "image" else ()
+        )
     )
     return items if labels is None or value == "all" else labels.positions(kind, items)

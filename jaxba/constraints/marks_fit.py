@@ -1,7 +1,8 @@
-"""Whether marks can be what a survey says, before anything is solved: in their images, one point each, in their places.
+"""Whether marks can be what a survey says, before anything is solved: in their images, one point
+each, in their places.
 
-What is compared is the scene as images alone have it, so that only what neither noise nor a bent scene explains is
-said; `Solution.notes` tests the rest."""
+What is compared is the scene as images alone have it, so that only what neither noise nor a bent
+scene explains is said; `Solution.notes` tests the rest."""
 
 from __future__ import annotations
 
@@ -19,20 +20,21 @@ from jaxba.problem.marks import Marks
 from jaxba.problem.misfit import MISFIT, extent_of, wrong_places, wrong_text
 from jaxba.results.retriangulate import retriangulate
 
-EDGE = 0.01  # share of an image by which marks may lie outside: its border may be cut by an undistortion
+# share of an image by which marks may lie outside: its border may be cut by an undistortion
+EDGE = 0.01
 
 SIZES = tuple(np.geomspace(0.1, 10.0, 47).tolist())
 """Sizes of photos in which marks may have been made, over those of the images: steps of a tenth."""
 
 BETTER, LEAST_LEFT = 0.1, 4
-"""Pixels of other photos are taken for the true ones if they leave this share of the misfit, with so many numbers more
-than the marks have."""
+"""Pixels of other photos are taken for the true ones if they leave this share of the misfit, with
+so many numbers more than the marks have."""
 
 ENOUGH = 100_000  # observations of which a median is taken
 
 DEEPER = 0.1
-"""Share of the extent of cameras and points by which these may be too far from the cameras, whose positions alone are
-measured: images that all look down hardly tell a focal length from a height."""
+"""Share of the extent of cameras and points by which these may be too far from the cameras, whose
+positions alone are measured: images that all look down hardly tell a focal length from a height."""
 
 MANY = 0.1  # share of the pixels which lie outside that typing errors do not explain
 
@@ -55,28 +57,36 @@ class Clicks(NamedTuple):
 
 
 def outside(clicks: Clicks, sigma: float) -> Bool[np.ndarray, " pixels"]:
-    """Which pixels lie outside of their image, by more than their noise (`sigma`, pixels) and a border."""
+    """Which pixels lie outside of their image, by more than their noise (`sigma`, pixels) and a
+    border."""
     beyond = EDGE * clicks.sizes + MISFIT * sigma
     out = (clicks.pixels < -beyond) | (clicks.pixels > clicks.sizes + beyond)
     known = np.all(clicks.sizes > 0, axis=1)
     return np.any(out, axis=1) & known
 
 
-def outside_text(clicks: Clicks, out: Bool[np.ndarray, " pixels"], names: list[str], images: tuple[str, ...]) -> str:
-    """Which marks lie outside of which images, with the sizes of these. Raises ValueError: this, if they are many."""
+def outside_text(
+    clicks: Clicks, out: Bool[np.ndarray, " pixels"], names: list[str], images: tuple[str, ...]
+) -> str:
+    """Which marks lie outside of which images, with the sizes of these. Raises ValueError: this, if
+    they are many."""
     first = int(np.argmax(out))
     width, height = clicks.sizes[first].tolist()
     others = int(out.sum()) - 1
     more = f", and {others} more" if others else ""
     name, image = names[clicks.mark[first]], images[clicks.image[first]]
-    text = f"pixels of {name} lie outside of {image} ({width:g} x {height:g}){more}: photos of another size, or turned?"
+    text = (
+        f"pixels of {name} lie outside of {image} ({width:g} x {height:g}){more}: photos of "
+        "another size, or turned?"
+    )
     if out.sum() > max(1, MANY * len(out)):
         raise ValueError(text)
     return text
 
 
 def say(where: str, texts: list[str], strict: bool) -> None:
-    """Notes what does not fit; `where` is file and key. Raises ValueError: the first text, if `strict`."""
+    """Notes what does not fit; `where` is file and key. Raises ValueError: the first text, if
+    `strict`."""
     if texts and strict:
         raise ValueError(texts[0])
     report([f"{where}: {text}" for text in texts])
@@ -121,7 +131,8 @@ def pixels_texts(
     image = problem.labels.names[clicks.image[largest]] if problem.labels is not None else ""
     listed = names_of([f"{names[at]} ({rms[at]:.3g})" for at in wrong.tolist()])
     return [
-        f"rays of the same point do not meet, by pixels (RMS): {listed}; those of {names[wrong[0]]} least in {image}. "
+        f"rays of the same point do not meet, by pixels (RMS): {listed}; those of "
+        f"{names[wrong[0]]} least in {image}. "
         f"The pixels are said to be accurate to {sigma:g}"
     ]
 
@@ -138,7 +149,8 @@ def _apart(marks: BundleProblem) -> Float[np.ndarray, "pixels 2"]:
 def _refuse_other_photos(
     marks: BundleProblem, clicks: Clicks, observed: Callable[[np.ndarray], np.ndarray], noise: float
 ) -> None:
-    """Raises ValueError: the rays of all marks meet if pixels are those of photos of another size, or turned."""
+    """Raises ValueError: the rays of all marks meet if pixels are those of photos of another size,
+    or turned."""
 
     def misfit(pixels: np.ndarray, size: float = 1.0) -> float:
         """RMS in pixels of the photos, of the numbers that points do not take up."""
@@ -166,7 +178,9 @@ def _refuse_other_photos(
     bound = BETTER * given
     for what, pixels in turned.items():
         if misfit(pixels) < min(bound, MISFIT * noise):
-            raise ValueError(f"the pixels seem to be those of photos {what}: they fit if this is undone")
+            raise ValueError(
+                f"the pixels seem to be those of photos {what}: they fit if this is undone"
+            )
     misfits = [scaled(size) for size in SIZES]
     best = int(np.argmin(misfits))
     if not misfits[best] < 0.5 * given:
@@ -174,17 +188,23 @@ def _refuse_other_photos(
     from scipy.optimize import minimize_scalar
 
     between = (SIZES[max(best - 1, 0)], SIZES[min(best + 1, len(SIZES) - 1)])
-    nearest: Any = minimize_scalar(scaled, bounds=between, method="bounded", options={"xatol": 1e-5 * between[0]})
+    nearest: Any = minimize_scalar(
+        scaled, bounds=between, method="bounded", options={"xatol": 1e-5 * between[0]}
+    )
     if nearest.fun < min(bound, MISFIT * noise):
         width, height = clicks.sizes[0].tolist()
         raise ValueError(
-            f"the pixels seem to be those of photos of {nearest.x:.3g} times the size of the images: about "
+            f"the pixels seem to be those of photos of {nearest.x:.3g} times the size of the "
+            "images: about "
             f"{nearest.x * width:.0f} x {nearest.x * height:.0f} instead of {width:g} x {height:g}"
         )
 
 
-def places_texts(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "marks 3"]) -> list[str]:
-    """How measured places of marks differ from where a scene that measured positions placed has them.
+def places_texts(
+    problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "marks 3"]
+) -> list[str]:
+    """How measured places of marks differ from where a scene that measured positions placed has
+    them.
 
     Args:
         problem: in the frame of the places.
@@ -201,19 +221,34 @@ def places_texts(problem: BundleProblem, marks: Marks, met: Float[np.ndarray, "m
     moved = float(np.linalg.norm(shift))
     spread = float(np.median(np.linalg.norm(away - shift, axis=1)))
     if moved > bound and spread < SAME * moved:
-        axes = ", ".join(f"{axis} {number:.3g}" for axis, number in zip("xyz", shift.tolist(), strict=True))
+        axes = ", ".join(
+            f"{axis} {number:.3g}" for axis, number in zip("xyz", shift.tolist(), strict=True)
+        )
         upright = abs(shift[2]) > UPRIGHT * moved
-        what = "heights above the ellipsoid and above the geoid, or of two units?" if upright else "two frames?"
-        return [f"the points lie {moved:.3g} from where position_priors have them, all alike ({axes}): {what}"]
+        what = (
+            "heights above the ellipsoid and above the geoid, or of two units?"
+            if upright
+            else "two frames?"
+        )
+        return [
+            f"the points lie {moved:.3g} from where position_priors have them, all alike ({axes}): "
+            f"{what}"
+        ]
     if np.median(distance) > bound:
         half = f"half of them by {np.median(distance):.3g} or more"
-        return [f"the points do not lie where position_priors have them, {half}: another frame, axes or units?"]
+        return [
+            f"the points do not lie where position_priors have them, {half}: another frame, axes "
+            "or units?"
+        ]
     covariances = marks.stddev[:, :, None] ** 2 * np.eye(3)
     wrong = wrong_places(marks.places, away, covariances)
     wrong = wrong[distance[wrong] > bound]
     if not len(wrong):
         return []
-    return [f"points are not where the scene has them: {wrong_text(marks.names.__getitem__, wrong, away, covariances)}"]
+    return [
+        "points are not where the scene has them: "
+        f"{wrong_text(marks.names.__getitem__, wrong, away, covariances)}"
+    ]
 
 
 def _deviation_of_positions(problem: BundleProblem) -> float:

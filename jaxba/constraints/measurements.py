@@ -1,4 +1,5 @@
-"""What a file of constraints says that was measured besides pixels, as residuals (`jaxba.residuals`)."""
+"""What a file of constraints says that was measured besides pixels, as residuals
+(`jaxba.residuals`)."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from jaxba.problem.labels import Part
 from jaxba.problem.row_data import is_unit
 
 MEASURED = {
-    "control_points": "positions: {id: [x, y, z]}, or file, check, pixels, crs and align; stddev, loss and loss_scale",
+    "control_points": "positions: {id: [x, y, z]}, or file, check, pixels, crs and align; stddev, "
+    "loss and loss_scale",
     "distances": "a list of {points: [id, id], length, stddev}",
     "gravity": "up, directions: {name or id: [x, y, z]}, or database; stddev, loss and loss_scale",
     "relative_poses": "a list of {images: [name or id, name or id], rotation, translation, stddev}",
@@ -31,12 +33,18 @@ MEASURED = {
 
 
 def with_measured(
-    problem: BundleProblem, where: str, key: str, value: Any, strict: bool, model: StrPath | None = None
+    problem: BundleProblem,
+    where: str,
+    key: str,
+    value: Any,
+    strict: bool,
+    model: StrPath | None = None,
 ) -> BundleProblem:
     """The problem, perhaps of a COLMAP model, with what a key of `MEASURED` says.
 
-    What is measured of images and points that the problem does not have is left out with a note that begins with
-    `where`, or refused if `strict`. Raises ValueError: something that the value cannot be; one line."""
+    What is measured of images and points that the problem does not have is left out with a note
+    that begins with `where`, or refused if `strict`. Raises ValueError: something that the value
+    cannot be; one line."""
     if key == "depths":
         return _with_depths(problem, where, value, strict, model)
     kind, what, loss = "point" if key in ("control_points", "distances") else "image", "pairs", None
@@ -47,7 +55,12 @@ def with_measured(
         items, columns = values.parse_pairs(value, kind, shapes)
     else:
         what = "directions" if key == "gravity" else "positions"
-        if key == "gravity" and isinstance(value, dict) and "database" in value and what not in value:
+        if (
+            key == "gravity"
+            and isinstance(value, dict)
+            and "database" in value
+            and what not in value
+        ):
             found = read_gravity(values.beside(where, value, "database"))
             value = {name: one for name, one in value.items() if name != "database"}
             value[what] = {name: list(map(str, up.tolist())) for name, up in found.items()}
@@ -59,12 +72,16 @@ def with_measured(
     columns = {name: [column[k] for k in kept] for name, column in columns.items()}
     stddev, of = np.stack(columns["stddev"]), columns.get(what)
     if key == "control_points":
-        rows = residuals.control_point(point=at[0], position=of, whitening=np.eye(3) / stddev[:, None])
+        rows = residuals.control_point(
+            point=at[0], position=of, whitening=np.eye(3) / stddev[:, None]
+        )
     elif key == "gravity":
         up = values.parse_numbers("up", value["up"], "three numbers", (3,))
         rows = residuals.gravity(pose=at[0], direction=of, up=up[None], sigma=stddev)
     elif key == "distances":
-        rows = residuals.distance(point=at[0], point_2=at[1], length=columns["length"], sigma=stddev)
+        rows = residuals.distance(
+            point=at[0], point_2=at[1], length=columns["length"], sigma=stddev
+        )
     else:
         from scipy.spatial.transform import Rotation  # imported late, as in geometry.py
 
@@ -72,8 +89,12 @@ def with_measured(
             if len(turn) == 4 and not is_unit(turn[None]).all():
                 pair = ", ".join(items[k])
                 written = ", ".join(f"{number:g}" for number in turn)
-                raise ValueError(f"{pair}: rotation: must be a quaternion of length one, not [{written}]")
-        read = lambda x: Rotation.from_quat(np.roll(x, -1)) if len(x) == 4 else Rotation.from_rotvec(x)
+                raise ValueError(
+                    f"{pair}: rotation: must be a quaternion of length one, not [{written}]"
+                )
+        read = lambda x: (
+            Rotation.from_quat(np.roll(x, -1)) if len(x) == 4 else Rotation.from_rotvec(x)
+        )
         rotation = np.stack([read(x).as_matrix() for x in columns["rotation"]])
         whitening = np.eye(6) / np.repeat(stddev, 3, axis=1)[:, None]
         data = {"rotation": rotation, "translation": columns["translation"], "whitening": whitening}
@@ -100,26 +121,42 @@ def parts_of(
         items: names or ids, as text; each item has n of them.
         what: what is left out with an item.
         strict: whether to refuse what would be left out with a note.
-        table: whether another program wrote the names, so that numbers are names of images rather than ids.
+        table: whether another program wrote the names, so that numbers are names of images rather
+            than ids.
 
     Returns:
         Positions in the problem, and which items they are of.
 
     Raises:
         ValueError: none is left, or one is left out and `strict`; one line."""
-    positions, doubts = _positions_of(problem, kind, [name for item in items for name in item], table)
+    positions, doubts = _positions_of(
+        problem, kind, [name for item in items for name in item], table
+    )
     known = np.array([[name in positions for name in item] for item in items])
     kept = np.flatnonzero(known.all(axis=1))
     others = list(dict.fromkeys(np.array(items, object)[~known]))
-    example = f"; it has {problem.labels.names[0]}" if kind == "image" and problem.labels is not None else ""
+    example = (
+        f"; it has {problem.labels.names[0]}"
+        if kind == "image" and problem.labels is not None
+        else ""
+    )
     unclear = [name for name in others if name in doubts]
     unknown = [name for name in others if name not in doubts]
     if not len(kept):
         doubt = f"; {doubts[unclear[0]]}" if unclear else example
         raise ValueError(f"none of the {kind}s is in the problem: {values.names_of(others)}{doubt}")
-    leave_out(where, kind, f"{what} of {{}} that the problem does not have", unknown, strict, example)
+    leave_out(
+        where, kind, f"{what} of {{}} that the problem does not have", unknown, strict, example
+    )
     if unclear:
-        leave_out(where, kind, f"{what} of {{}} whose names are not clear", unclear, strict, f"; {doubts[unclear[0]]}")
+        leave_out(
+            where,
+            kind,
+            f"{what} of {{}} whose names are not clear",
+            unclear,
+            strict,
+            f"; {doubts[unclear[0]]}",
+        )
     at = np.array([[positions[name] for name in items[k]] for k in kept], np.int64)
     return at.T, kept
 
@@ -127,7 +164,8 @@ def parts_of(
 def _positions_of(
     problem: BundleProblem, kind: Part, names: list[str], table: bool
 ) -> tuple[dict[str, int], dict[str, str]]:
-    """Positions of images or points by names or ids, and why other names of images are not clear."""
+    """Positions of images or points by names or ids, and why other names of images are not
+    clear."""
     labels = problem.labels
     if labels is None:
         numbers = range(problem.num_cameras if kind == "image" else problem.num_points)
@@ -141,10 +179,14 @@ def _positions_of(
     if table:
         return by_name or by_id, doubts
     exact = {name: at for name, at in by_name.items() if labels.names[at] == name}
-    return by_name | by_id | exact, {name: doubt for name, doubt in doubts.items() if name not in by_id}
+    return by_name | by_id | exact, {
+        name: doubt for name, doubt in doubts.items() if name not in by_id
+    }
 
 
-def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool, more: str = "") -> None:
+def leave_out(
+    where: str, noun: str, what: str, names: list[str], strict: bool, more: str = ""
+) -> None:
     """Notes what is left out, if it is anything.
 
     Args:
@@ -163,17 +205,25 @@ def leave_out(where: str, noun: str, what: str, names: list[str], strict: bool, 
     report([f"{where}: left out {what}: {values.names_of(names)}{more}"] if names else [])
 
 
-def _with_depths(problem: BundleProblem, where: str, value: Any, strict: bool, model: StrPath | None) -> BundleProblem:
-    """Depths from maps of the shape of their images, each with a scale, at first the median, and a shift, at first 0.
+def _with_depths(
+    problem: BundleProblem, where: str, value: Any, strict: bool, model: StrPath | None
+) -> BundleProblem:
+    """Depths from maps of the shape of their images, each with a scale, at first the median, and a
+    shift, at first 0.
 
-    Of a BAL lens, whose pixels do not say where the image is, the principal point is that of the model, or else the
-    middle of the map. Raises ValueError: a map has another shape than its image, or disparities; one line."""
+    Of a BAL lens, whose pixels do not say where the image is, the principal point is that of the
+    model, or else the middle of the map. Raises ValueError: a map has another shape than its image,
+    or disparities; one line."""
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
     folder, loss = values.beside(where, value, "folder"), values.parse_loss(value)
     if not folder.is_dir():
         raise ValueError(f"folder: there is no folder {folder}")
     relative = values.parse_deviations("stddev", value["stddev"])[0]
-    names = list(map(str, range(problem.num_cameras))) if problem.labels is None else problem.labels.names
+    names = (
+        list(map(str, range(problem.num_cameras)))
+        if problem.labels is None
+        else problem.labels.names
+    )
     files = files_of_images(folder, names, ".npy")
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
     leave_out(where, "image", "{} without a map", missing, strict)

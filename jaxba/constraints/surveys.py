@@ -21,7 +21,10 @@ from jaxba.problem.geometry import camera_centers
 from jaxba.problem.measured import with_position_priors
 from jaxba.problem.misfit import ON_ITS_HEAD, on_its_head
 
-POSITIONS = "positions: {name or id: [x, y, z]}, or file, database or photos; crs, stddev, loss, loss_scale and align"
+POSITIONS = (
+    "positions: {name or id: [x, y, z]}, or file, database or photos; crs, stddev, loss, "
+    "loss_scale and align"
+)
 """What the key `position_priors` holds."""
 
 SOURCES = ("file", "database", "photos")  # keys that say where positions are read
@@ -30,14 +33,16 @@ SOURCES = ("file", "database", "photos")  # keys that say where positions are re
 def with_positions(
     problem: BundleProblem, where: str, value: Any, strict: bool, frame: Frame | None
 ) -> tuple[BundleProblem, Frame | None]:
-    """The problem with measured positions of images, and the frame of the scene where positions are on the earth. The
-    rest is as for `with_measured`."""
+    """The problem with measured positions of images, and the frame of the scene where positions are
+    on the earth. The rest is as for `with_measured`."""
     source = next((key for key in SOURCES if isinstance(value, dict) and key in value), None)
     given = _inline(value) if source is None else _read(problem, where, source, value, strict)
     loss = values.parse_loss(value)
     align = values.parse_truth("align", value.get("align", "true"))
     items = [[name] for name in given.names]
-    (images,), kept = parts_of(problem, where, "image", items, "positions", strict, table=source is not None)
+    (images,), kept = parts_of(
+        problem, where, "image", items, "positions", strict, table=source is not None
+    )
     crs = given.crs
     if not crs and frame is not None:
         crs = frame.crs
@@ -54,7 +59,9 @@ def with_positions(
         places = places * np.where(np.isnan(given.units), 1.0, given.units)[[0, 0, 1]]
     assert covariances is not None
     covariances = covariances[kept]
-    problem = with_position_priors(problem, places, covariances, images=images.tolist(), loss=loss, align=align)
+    problem = with_position_priors(
+        problem, places, covariances, images=images.tolist(), loss=loss, align=align
+    )
     if align and crs and on_its_head(problem):
         centres = camera_centers(problem.cameras)[images]
         report([f"{where}: {ON_ITS_HEAD}"] if check_axes(centres, places, covariances) else [])
@@ -88,7 +95,10 @@ def _with_a_place(
     fixed = has_fix(places, degrees)
     lost = [given.names[row] for row in rows[~fixed]]
     if not fixed.any():
-        raise ValueError(f"no image has a position: all are empty, 0 or impossible, as of {values.names_of(lost)}")
+        raise ValueError(
+            "no image has a position: all are empty, 0 or impossible, as of "
+            f"{values.names_of(lost)}"
+        )
     leave_out(where, "image", "positions of {} without a fix", lost, strict)
     kept = np.flatnonzero(fixed)
     _, first, inverse = np.unique(images[kept], return_index=True, return_inverse=True)
@@ -103,7 +113,8 @@ def _with_a_place(
 
 
 def _inline(value: Any) -> Positions:
-    """Positions in the file of constraints itself; on the earth latitude stands before longitude."""
+    """Positions in the file of constraints itself; on the earth latitude stands before
+    longitude."""
     items, columns = values.parse_vectors(value, "positions", "image", (), ("align", "crs"))
     crs = values.parse_crs(value)
     degrees = crs != "" and is_geographic(crs)
@@ -113,7 +124,8 @@ def _inline(value: Any) -> Positions:
 
 
 def _read(problem: BundleProblem, where: str, source: str, value: Any, strict: bool) -> Positions:
-    """Positions of a file, a database or photos, with the coordinate system and standard deviations of `value`."""
+    """Positions of a file, a database or photos, with the coordinate system and standard deviations
+    of `value`."""
     values.parse_mapping(value, [source], ["crs", "stddev", "loss", "loss_scale", "align"])
     path = values.beside(where, value, source)
     crs = values.parse_crs(value)
@@ -127,7 +139,9 @@ def _read(problem: BundleProblem, where: str, source: str, value: Any, strict: b
     if given.degrees and (crs or given.crs) and not is_geographic(crs or given.crs):
         raise ValueError(f"crs: latitudes and longitudes are not of {crs or given.crs}")
     if "stddev" in value or given.covariances is None:
-        stddev = values.parse_stddev(value, given.names, "image", partly=given.covariances is not None)
+        stddev = values.parse_stddev(
+            value, given.names, "image", partly=given.covariances is not None
+        )
         covariances = stddev[:, :, None] ** 2 * np.eye(3)
         if given.covariances is not None:
             covariances = np.where(np.isnan(stddev[:, :1, None]), given.covariances, covariances)
@@ -141,5 +155,7 @@ def _photos(problem: BundleProblem, where: str, folder: Path, strict: bool) -> P
         raise ValueError("photos: the problem does not name its images")
     names = problem.labels.names
     positions = read_photos(folder, names)
-    leave_out(where, "photo", "{} without a position", sorted({*names} - {*positions.names}), strict)
+    leave_out(
+        where, "photo", "{} without a position", sorted({*names} - {*positions.names}), strict
+    )
     return positions

@@ -1,4 +1,5 @@
-"""Values in a file of constraints: what each key may hold, with one line in the file's own words if it does not.
+"""Values in a file of constraints: what each key may hold, with one line in the file's own words if
+it does not.
 
 The file is read as text alone: `000010` is a name, and a number where a number is meant."""
 
@@ -27,27 +28,37 @@ def names_of(names: Sequence[str]) -> str:
 
 
 def meant(items: Sequence[str], names: Container[str] = ()) -> list[Any]:
-    """What items of the file mean: of each text a name if there is such a one, else an id or a position.
+    """What items of the file mean: of each text a name if there is such a one, else an id or a
+    position.
 
-    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules."""
-    numbers = {item for item in items if re.fullmatch(r"0|[1-9]\d*", item, re.ASCII) and item not in names}
+    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's
+    rules."""
+    numbers = {
+        item for item in items if re.fullmatch(r"0|[1-9]\d*", item, re.ASCII) and item not in names
+    }
     return [int(item) if item in numbers else item for item in items]
 
 
 def parse_items(value: Any, what: str) -> list[str]:
-    """A list of names or ids; one alone counts as a list, nothing as an empty one. Raises ValueError: one line."""
+    """A list of names or ids; one alone counts as a list, nothing as an empty one. Raises
+    ValueError: one line."""
     items = value if isinstance(value, list) else [value] if value != "" else []
     for item in items:
         if not isinstance(item, str) or not item:
-            raise ValueError(f"must be a list ({what}), not {_written(value if items is not value else item)}")
+            raise ValueError(
+                f"must be a list ({what}), not {_written(value if items is not value else item)}"
+            )
     return items
 
 
 def parse_mapping(value: Any, needed: Sequence[str], others: Sequence[str] = ()) -> dict[str, Any]:
-    """A mapping with all of some keys, and no more than some others. Raises ValueError: something else; one line."""
+    """A mapping with all of some keys, and no more than some others. Raises ValueError: something
+    else; one line."""
     keys = (*needed, *others)
     if not isinstance(value, dict):
-        raise ValueError(f"must be a mapping with the keys {', '.join(keys)}, not {_written(value)}")
+        raise ValueError(
+            f"must be a mapping with the keys {', '.join(keys)}, not {_written(value)}"
+        )
     unknown = [key for key in value if key not in keys]
     if unknown:
         raise ValueError(f"unknown key {_written(unknown[0])}; there are {', '.join(keys)}")
@@ -59,34 +70,47 @@ def parse_mapping(value: Any, needed: Sequence[str], others: Sequence[str] = ())
 def parse_vectors(
     value: Any, name: str, kind: str, needed: Sequence[str] = (), others: Sequence[str] = ()
 ) -> tuple[list[list[str]], dict[str, Any]]:
-    """Images or points, with a vector of each, such as `positions`, and standard deviations along x, y and z: `stddev`
-    is one number, three, a mapping from each image or point to one or three, or a list of these in the order of the
-    vectors. Raises ValueError: something else; one line that names the key and the image or point."""
+    """Images or points, with a vector of each, such as `positions`, and standard deviations along
+    x, y and z: `stddev` is one number, three, a mapping from each image or point to one or three,
+    or a list of these in the order of the vectors. Raises ValueError: something else; one line that
+    names the key and the image or point."""
     parse_mapping(value, [name, *needed], ["stddev", "loss", "loss_scale", *others])
     given = value[name]
     if not isinstance(given, dict) or not given:
-        raise ValueError(f"{name}: must be a mapping from {kind}s to [x, y, z], not {_written(given)}")
+        raise ValueError(
+            f"{name}: must be a mapping from {kind}s to [x, y, z], not {_written(given)}"
+        )
     items = parse_items(list(given), f"names or ids of {kind}s")
-    vectors = [parse_numbers(f"{name}: {item}", place, "three numbers", (3,)) for item, place in given.items()]
+    vectors = [
+        parse_numbers(f"{name}: {item}", place, "three numbers", (3,))
+        for item, place in given.items()
+    ]
     return [[item] for item in items], {name: vectors, "stddev": parse_stddev(value, items, kind)}
 
 
 def parse_pairs(
     value: Any, kind: str, shapes: dict[str, tuple[tuple[int, ...], ...]]
 ) -> tuple[list[list[str]], dict[str, Any]]:
-    """A list of pairs of images or points, and numbers of some shapes. Raises ValueError: something else; one line."""
+    """A list of pairs of images or points, and numbers of some shapes. Raises ValueError: something
+    else; one line."""
     if not isinstance(value, list) or not value:
         raise ValueError(f"must be a list of mappings, not {_written(value)}")
     pairs, columns = [], {name: [] for name in shapes}
     for item in value:
-        pairs.append(parse_items(parse_mapping(item, [f"{kind}s", *shapes])[f"{kind}s"], f"two {kind}s"))
+        pairs.append(
+            parse_items(parse_mapping(item, [f"{kind}s", *shapes])[f"{kind}s"], f"two {kind}s")
+        )
         if len(pairs[-1]) != 2 or pairs[-1][0] == pairs[-1][1]:
             raise ValueError(f"{kind}s: must be two, not {_written(item[f'{kind}s'])}")
         for name, allowed in shapes.items():
             what = " or ".join(f"{shape[0]} numbers" if shape else "a number" for shape in allowed)
-            columns[name].append(parse_numbers(f"{', '.join(pairs[-1])}: {name}", item[name], what, *allowed))
+            columns[name].append(
+                parse_numbers(f"{', '.join(pairs[-1])}: {name}", item[name], what, *allowed)
+            )
             if name in ("stddev", "length") and not is_positive(columns[name][-1][None]).all():
-                raise ValueError(f"{', '.join(pairs[-1])}: {name}: must be positive, not {_written(item[name])}")
+                raise ValueError(
+                    f"{', '.join(pairs[-1])}: {name}: must be positive, not {_written(item[name])}"
+                )
     return pairs, columns
 
 
@@ -121,11 +145,18 @@ def parse_stddev(
     Raises:
         ValueError: something else; one line."""
     given = value.get("stddev", "1")
-    if isinstance(given, list) and (len(given) != 3 or any(isinstance(item, list) for item in given)):
+    if isinstance(given, list) and (
+        len(given) != 3 or any(isinstance(item, list) for item in given)
+    ):
         if len(given) != len(names):
             what = f"must be one number, three, or one or three for each of {len(names)} {kind}s"
             raise ValueError(f"stddev: {what}, not {len(given)} values")
-        return np.stack([parse_deviations(f"stddev: {name}", item) for name, item in zip(names, given, strict=True)])
+        return np.stack(
+            [
+                parse_deviations(f"stddev: {name}", item)
+                for name, item in zip(names, given, strict=True)
+            ]
+        )
     if not isinstance(given, dict):
         return np.tile(parse_deviations("stddev", given), (len(names), 1))
     if kind == "image":
@@ -135,7 +166,12 @@ def parse_stddev(
     if missing and not (partly and len(missing) < len(names)):
         raise ValueError(f"stddev: missing for {names_of(missing)}")
     none = np.full(3, np.nan)
-    return np.stack([parse_deviations(f"stddev: {name}", given[name]) if name in given else none for name in names])
+    return np.stack(
+        [
+            parse_deviations(f"stddev: {name}", given[name]) if name in given else none
+            for name in names
+        ]
+    )
 
 
 def parse_deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:
@@ -145,7 +181,9 @@ def parse_deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:
     return np.broadcast_to(numbers, 3)
 
 
-def parse_numbers(where: str, value: Any, what: str, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+def parse_numbers(
+    where: str, value: Any, what: str, *shapes: tuple[int, ...]
+) -> Float[np.ndarray, "..."]:
     """Finite numbers, also written as text."""
     single = not isinstance(value, list)
     try:
@@ -166,7 +204,8 @@ def parse_word(value: dict[str, Any], key: str) -> str:
 
 
 def parse_crs(value: dict[str, Any]) -> str:
-    """The coordinate system of the key `crs`, empty if there is none. Raises ValueError: it is no word; one line."""
+    """The coordinate system of the key `crs`, empty if there is none. Raises ValueError: it is no
+    word; one line."""
     return parse_word(value, "crs") if "crs" in value else ""
 
 

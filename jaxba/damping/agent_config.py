@@ -1,4 +1,5 @@
-"""How an agent is connected to the solver: what it observes, what its actions mean, and the step that it drives."""
+"""How an agent is connected to the solver: what it observes, what its actions mean, and the step
+that it drives."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from jaxba.problem.options import EMBEDDED, LensStep, Refinement, StepOptions, c
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
 
-LARGEST_ESCALATION = 12.0  # decades; more than the whole range of lambda would have no further effect
+# decades; more than the whole range of lambda would have no further effect
+LARGEST_ESCALATION = 12.0
 
 
 @dataclass(frozen=True)
@@ -18,9 +20,9 @@ class AgentConfig:
     """How an agent is connected to the solver. Hashable; stored in a policy's file."""
 
     observation: Observation = "scale-free"
-    """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
-    errors. `duration`: minus the duration of each of the last iterations by the game's clock (`features.duration`; the
-    paper's reversed roles of state and reward)."""
+    """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms.
+    `paper`: the last errors. `duration`: minus the duration of each of the last iterations by the
+    game's clock (`features.duration`; the paper's reversed roles of state and reward)."""
 
     history: int = 5
     """Number of past steps in an observation. Source of the default: the paper's state size."""
@@ -32,19 +34,22 @@ class AgentConfig:
     """log10 of the largest lambda."""
 
     first_low: float = -5.0
-    """log10 of the smallest lambda of the first iteration, when nothing is known about the problem yet."""
+    """log10 of the smallest lambda of the first iteration, when nothing is known about the problem
+    yet."""
 
     descent: float = 1.5
-    """Decades by which lambda may fall from one iteration to the next. Without this limit and `first_low` a policy
-    alternated between 10 and 1e-7 and ended 6% above the best cost of Ladybug-49. With a floor of 1e-6 instead, flat
-    valleys of the held-out scenes were never crossed."""
+    """Decades by which lambda may fall from one iteration to the next. Without this limit and
+    `first_low` a policy alternated between 10 and 1e-7 and ended 6% above the best cost of
+    Ladybug-49. With a floor of 1e-6 instead, flat valleys of the held-out scenes were never
+    crossed."""
 
     min_gain: float = 0.0
     """Gain ratio that a candidate must exceed; 0 accepts any decrease."""
 
     guard: GuardMode = "hand-over"
-    """`off`: the agent's lambdas are used as they are. `hand-over`: they are limited (`damping/guard.py`), and after
-    `patience` rejections in a row Ceres' rule chooses lambda to the end of the solve."""
+    """`off`: the agent's lambdas are used as they are. `hand-over`: they are limited
+    (`damping/guard.py`), and after `patience` rejections in a row Ceres' rule chooses lambda to the
+    end of the solve."""
 
     patience: int = 2
     """Rejections in a row after which Ceres' rule takes over."""
@@ -53,8 +58,8 @@ class AgentConfig:
     """Rejections in all after which Ceres' rule takes over."""
 
     escalate: float = 0.5
-    """Decades by which lambda rises at least after a rejection, and after an accepted step for each time that it was
-    shortened. Without effect if it is 0 or the guard is off."""
+    """Decades by which lambda rises at least after a rejection, and after an accepted step for each
+    time that it was shortened. Without effect if it is 0 or the guard is off."""
 
     refinement: Refinement = field(default_factory=Refinement)
     """Embedded iterations of the step."""
@@ -68,7 +73,9 @@ class AgentConfig:
         if not 1 <= self.history <= 20:
             raise ValueError(f"history must be 1 to 20, is {self.history}")
         if not -15 <= self.low < self.high <= 10:
-            raise ValueError(f"lambda must range over decades within -15 to 10, not {self.low} to {self.high}")
+            raise ValueError(
+                f"lambda must range over decades within -15 to 10, not {self.low} to {self.high}"
+            )
         if self.patience < 1 or self.max_rejections < 1:
             raise ValueError("patience and max_rejections must be at least 1")
         if not 0 <= self.min_gain < 1:
@@ -88,6 +95,7 @@ class AgentConfig:
 
 
 def embedded() -> AgentConfig:
-    """An agent whose step has all embedded iterations, and distortion stepped per pixel. Candidates without sufficient
-    decrease (Nocedal, Wright 2006, algorithm 4.1) are shortened and tried again."""
+    """An agent whose step has all embedded iterations, and distortion stepped per pixel. Candidates
+    without sufficient decrease (Nocedal, Wright 2006, algorithm 4.1) are shortened and tried
+    again."""
     return AgentConfig(min_gain=0.25, refinement=EMBEDDED, lens_step="pixels")

@@ -1,6 +1,7 @@
 """What an agent observes: features of the last steps and of the solve.
 
-The game and the policies share this, so that a policy observes the same in a solve as in training."""
+The game and the policies share this, so that a policy observes the same in a solve as in
+training."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
 
 FLOOR = 1e-9  # smallest relative decrease that a feature distinguishes from zero
-PAPER_LIMIT = 1000.0  # upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023
+# upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023
+PAPER_LIMIT = 1000.0
 FEATURE_LIMIT = 2.0  # bound of the absolute value of every scale-free feature
 
 
@@ -28,8 +30,9 @@ DURATIONS = (
     0.944, 0.964, 0.989, 1.008, 1.033, 1.069, 1.103, 1.169, 1.268, 1.673,
 )
 # fmt: on
-"""Quantiles (2.5%, 7.5%, ...) of the duration of an iteration over its mean. Measured once: processor time of 2,900
-compiled plain steps on a scene of 10 cameras and 10 points with known lenses, two x86-64 cores, mean 0.22 ms."""
+"""Quantiles (2.5%, 7.5%, ...) of the duration of an iteration over its mean. Measured once:
+processor time of 2,900 compiled plain steps on a scene of 10 cameras and 10 points with known
+lenses, two x86-64 cores, mean 0.22 ms."""
 
 
 class StepFeatures(NamedTuple):
@@ -71,7 +74,8 @@ class Memory(NamedTuple):
     damping: Float[Array, ""]  # log10 of the last lambda
     gain: Float[Array, ""]  # gain ratio of the last step, -1 if not finite
     steps: Float[Array, "history features"]  # `StepFeatures` of the last steps, newest first
-    errors: Float[Array, " history"]  # the observation itself, unless it is `scale-free`; newest first
+    # the observation itself, unless it is `scale-free`; newest first
+    errors: Float[Array, " history"]
     cost: Float[Array, ""]
     smallest_accepted: Float[Array, ""]
     largest_rejected: Float[Array, ""]
@@ -89,7 +93,11 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
     """Before the first iteration."""
     dtype = info.cost.dtype
     number = lambda x: jnp.asarray(x, dtype)
-    error = jnp.minimum(_rms_error(info, info.cost), PAPER_LIMIT) if config.observation == "paper" else number(0.0)
+    error = (
+        jnp.minimum(_rms_error(info, info.cost), PAPER_LIMIT)
+        if config.observation == "paper"
+        else number(0.0)
+    )
     return Memory(
         info=info,
         iteration=jnp.zeros((), jnp.int32),
@@ -123,7 +131,9 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
         _scaled_decades(memory.smallest_accepted),
         _scaled_decades(memory.largest_rejected),
     ]
-    features = jnp.concatenate([memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])])
+    features = jnp.concatenate(
+        [memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])]
+    )
     return jnp.clip(jnp.nan_to_num(features), -FEATURE_LIMIT, FEATURE_LIMIT).astype(jnp.float32)
 
 
@@ -153,7 +163,9 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         "scale-free": lambda: jnp.zeros((), dtype),
     }[config.observation]()
     shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])
-    pick = lambda if_accepted, if_rejected: jnp.where(step.accepted, if_accepted, if_rejected).astype(dtype)
+    pick = lambda if_accepted, if_rejected: jnp.where(
+        step.accepted, if_accepted, if_rejected
+    ).astype(dtype)
     return Memory(
         info=memory.info,
         iteration=(memory.iteration + 1).astype(jnp.int32),
@@ -162,17 +174,24 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         steps=shifted(memory.steps, row),
         errors=shifted(memory.errors, error),
         cost=step.cost,
-        smallest_accepted=pick(jnp.minimum(damping, memory.smallest_accepted), memory.smallest_accepted),
+        smallest_accepted=pick(
+            jnp.minimum(damping, memory.smallest_accepted), memory.smallest_accepted
+        ),
         largest_rejected=pick(config.low, jnp.maximum(damping, memory.largest_rejected)),
         guard=update_guard(config, memory.guard, step),
     )
 
 
 def duration(step: StepInfo) -> Float[Array, ""]:
-    """Duration of an iteration by the game's clock over the mean: one of `DURATIONS`, as it has none of its own.
+    """Duration of an iteration by the game's clock over the mean: one of `DURATIONS`, as it has
+    none of its own.
 
-    Bits of the candidate's cost and of lambda draw it: reward and observation agree, and a solve repeats."""
-    bits = [lax.bitcast_convert_type(x.astype(jnp.float32), jnp.uint32) for x in (step.candidate_cost, step.damping)]
+    Bits of the candidate's cost and of lambda draw it: reward and observation agree, and a solve
+    repeats."""
+    bits = [
+        lax.bitcast_convert_type(x.astype(jnp.float32), jnp.uint32)
+        for x in (step.candidate_cost, step.damping)
+    ]
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), bits[0]), bits[1])
     choices = jnp.asarray(DURATIONS, step.cost.dtype)
     return choices[jax.random.randint(key, (), 0, len(DURATIONS))]

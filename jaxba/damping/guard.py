@@ -9,7 +9,8 @@ An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda
     after an overdamped step  lambda <= last lambda / 10
     after an inexact step     lambda >= last lambda
 
-After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the end of the solve."""
+After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the
+end of the solve."""
 
 from __future__ import annotations
 
@@ -26,12 +27,14 @@ from jaxba.damping.rules import LARGEST
 from jaxba.lm.records import StepInfo
 
 OVERDAMPED_DECREASE, OVERDAMPED_FRACTION = 1e-2, 0.5
-"""A step of full length is overdamped if its relative decrease is below the first number and damping's share of its
-curvature above the second. The next lambda must then be ten times smaller, or a solve could stop making progress
-without having converged. Shortened steps do not count: in a narrow valley (the COLMAP model bulani7) a smaller lambda
-was rejected twice after them, and Ceres' rule took over in iteration 8."""
+"""A step of full length is overdamped if its relative decrease is below the first number and
+damping's share of its curvature above the second. The next lambda must then be ten times smaller,
+or a solve could stop making progress without having converged. Shortened steps do not count: in a
+narrow valley (the COLMAP model bulani7) a smaller lambda was rejected twice after them, and Ceres'
+rule took over in iteration 8."""
 
-UNLIMITED = math.log10(LARGEST)  # log10 of the largest lambda of any rule: finite, as a state of the game must be
+# log10 of the largest lambda of any rule: finite, as a state of the game must be
+UNLIMITED = math.log10(LARGEST)
 
 
 class GuardState(NamedTuple):
@@ -44,15 +47,22 @@ class GuardState(NamedTuple):
 
 def initial_guard(config: AgentConfig, dtype: Any) -> GuardState:
     """Before the first iteration."""
-    return GuardState(jnp.asarray(config.first_low, dtype), jnp.asarray(UNLIMITED, dtype), Rescue.begin(dtype))
+    return GuardState(
+        jnp.asarray(config.first_low, dtype), jnp.asarray(UNLIMITED, dtype), Rescue.begin(dtype)
+    )
 
 
 def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> GuardState:
     """After an iteration."""
     rescue, rule = guard.rescue.after(step, config.patience, config.max_rejections)
-    damping, failures = jnp.log10(step.damping), jnp.where(step.accepted, times_shortened(step), 1.0)
+    damping, failures = (
+        jnp.log10(step.damping),
+        jnp.where(step.accepted, times_shortened(step), 1.0),
+    )
     lowest = jnp.where(is_inexact(step), damping, damping - config.descent)
-    lowest = jnp.where(failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest)
+    lowest = jnp.where(
+        failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest
+    )
     decrease = (step.previous_cost - step.cost) / step.previous_cost
     weak = (decrease < OVERDAMPED_DECREASE) & (step.damping_fraction > OVERDAMPED_FRACTION)
     highest = jnp.where(step.accepted & (step.step_fraction == 1) & weak, damping - 1, UNLIMITED)
@@ -66,8 +76,11 @@ def action_of(config: AgentConfig, decades: Float[Array, ""]) -> Float[Array, ""
     return (decades - middle) / half
 
 
-def damping_of(config: AgentConfig, guard: GuardState, action: Float[Array, ""]) -> Float[Array, ""]:
-    """The lambda that the guard, in its state before the iteration, allows for an action in (-1, 1)."""
+def damping_of(
+    config: AgentConfig, guard: GuardState, action: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The lambda that the guard, in its state before the iteration, allows for an action in (-1,
+    1)."""
     dtype = guard.lowest.dtype
     middle, half = _scale(config)
     least = smallest_decades(config.low, dtype)

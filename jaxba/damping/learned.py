@@ -1,4 +1,5 @@
-"""Policies that act as an agent does, through the guard: a trained network, or one and the same action always."""
+"""Policies that act as an agent does, through the guard: a trained network, or one and the same
+action always."""
 
 from __future__ import annotations
 
@@ -22,9 +23,11 @@ from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 
 class AgentPolicy(ABC):
-    """What policies of an agent share: they observe, choose an action, and get the lambda that the guard allows."""
+    """What policies of an agent share: they observe, choose an action, and get the lambda that the
+    guard allows."""
 
-    config: AgentConfig  # what is observed, what an action means, and the step that the policy is made for
+    # what is observed, what an action means, and the step that the policy is made for
+    config: AgentConfig
 
     @abstractmethod
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
@@ -67,7 +70,8 @@ class LearnedPolicy(ArrayRecord, AgentPolicy):
     The weights are traced: another policy of the same shape never recompiles."""
 
     layers: tuple[Layer, ...]
-    """Hidden layers with ReLU, then mean and log standard deviation of the action before its tanh."""
+    """Hidden layers with ReLU, then mean and log standard deviation of the action before its
+    tanh."""
 
     config: AgentConfig = field(metadata={"static": True})
     """What is observed and what an action means."""
@@ -85,16 +89,21 @@ SATURATED = 20.0  # its hyperbolic tangent is 1 in float32
 
 
 def always(action: float, config: AgentConfig) -> LearnedPolicy:
-    """The same action in every state, as a network of one layer without weights: what the guard alone achieves. The
-    best one of a game is the baseline that training has to beat."""
+    """The same action in every state, as a network of one layer without weights: what the guard
+    alone achieves. The best one of a game is the baseline that training has to beat."""
     inside = np.tanh(SATURATED / 2)
     before = np.arctanh(action) if abs(action) < inside else np.copysign(SATURATED, action)
     bias = np.array([before, 0], np.float32)
-    return LearnedPolicy((Layer(np.zeros((observation_size(config), 2), np.float32), bias),), config)
+    return LearnedPolicy(
+        (Layer(np.zeros((observation_size(config), 2), np.float32), bias),), config
+    )
 
 
 def learned_from(config: AgentConfig, actor: Any) -> LearnedPolicy:
-    """The policy of a trained actor's parameters (`training.networks.Actor`) and of the agent's configuration."""
+    """The policy of a trained actor's parameters (`training.networks.Actor`) and of the agent's
+    configuration."""
     stack = actor["params"]["MLP_0"]
-    layers = [Layer(stack[f"Dense_{k}"]["kernel"], stack[f"Dense_{k}"]["bias"]) for k in range(len(stack))]
+    layers = [
+        Layer(stack[f"Dense_{k}"]["kernel"], stack[f"Dense_{k}"]["bias"]) for k in range(len(stack))
+    ]
     return LearnedPolicy(tuple(layers), config)

@@ -49,7 +49,8 @@ class ProblemInfo(NamedTuple):
         max_iterations: Any,
         unit: Any = 1.0,
     ) -> ProblemInfo:
-        """The fields, of their types: `seen` says which cameras are observed, `focal` has their focal lengths."""
+        """The fields, of their types: `seen` says which cameras are observed, `focal` has their
+        focal lengths."""
         count = lambda n: jnp.asarray(n, jnp.int32)
         return cls(
             cost=cost,
@@ -66,11 +67,12 @@ class ProblemInfo(NamedTuple):
 class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 
-    A policy is a frozen dataclass and a pytree (`jaxba.register_pytree`): its numbers are traced, so that changing
-    one never recompiles, and its class selects the code. Both functions are pure and jittable.
+    A policy is a frozen dataclass and a pytree (`jaxba.register_pytree`): its numbers are traced,
+    so that changing one never recompiles, and its class selects the code. Both functions are pure
+    and jittable.
 
-    A policy may have a third function: `step_options(base)` gives the `StepOptions` that it was made for, which `solve`
-    uses unless its options say otherwise."""
+    A policy may have a third function: `step_options(base)` gives the `StepOptions` that it was
+    made for, which `solve` uses unless its options say otherwise."""
 
     @property
     def min_gain(self) -> Any:
@@ -87,7 +89,8 @@ class DampingPolicy(Protocol):
 
 
 def trained_step(policy: DampingPolicy) -> StepOptions:
-    """The step that a policy was made for: that of its method `step_options`, if it has one, else a plain step."""
+    """The step that a policy was made for: that of its method `step_options`, if it has one, else a
+    plain step."""
     made_for = getattr(policy, "step_options", None)
     return StepOptions() if made_for is None else made_for(StepOptions())
 
@@ -102,17 +105,24 @@ def check_policy(policy: object) -> None:
         raise ValueError(f"policy must be the name of a policy or a policy, not {policy!r}")
     name = type(policy).__name__
     if missing:
-        raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
+        raise ValueError(
+            f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)"
+        )
     structure = jax.tree.structure(policy)
     if jax.tree_util.treedef_is_leaf(structure):
-        raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jaxba.register_pytree")
+        raise ValueError(
+            f"policy {name} is no pytree: decorate its dataclass with jaxba.register_pytree"
+        )
     for other, seen in _structures.items():
         if other is not type(policy) and seen == structure:  # see `register_pytree`
             raise ValueError(
-                f"policy {name} cannot be told from policy {other.__name__} of this process, whose compiled program "
-                "might run in its place: decorate it with jaxba.register_pytree, not with JAX's register_dataclass"
+                f"policy {name} cannot be told from policy {other.__name__} of this process, whose "
+                "compiled program "
+                "might run in its place: decorate it with jaxba.register_pytree, not with JAX's "
+                "register_dataclass"
             )
     _structures[type(policy)] = structure
 
 
-_structures: dict[type, Any] = {}  # the last structure of a policy of each class, for `check_policy`
+# the last structure of a policy of each class, for `check_policy`
+_structures: dict[type, Any] = {}

@@ -21,9 +21,12 @@ FORMAT = "jaxba-policy-1"  # kind and version of a policy file, in its metadata
 LARGEST_FILE = 1 << 20  # largest size of a policy file in bytes
 
 
-def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str] | None = None) -> None:
-    """Writes a policy file atomically; solver names accept it if it ends in `.safetensors`. `metadata` says where the
-    policy comes from, for people. Raises InputError: the file would be larger than `LARGEST_FILE`."""
+def save_policy(
+    path: str | Path, policy: LearnedPolicy, metadata: dict[str, str] | None = None
+) -> None:
+    """Writes a policy file atomically; solver names accept it if it ends in `.safetensors`.
+    `metadata` says where the policy comes from, for people. Raises InputError: the file would be
+    larger than `LARGEST_FILE`."""
     from safetensors.numpy import save
 
     tensors = {}
@@ -33,13 +36,17 @@ def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str
     metadata = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
     content = _with_sorted_metadata(save(tensors, metadata))
     if len(content) > LARGEST_FILE:
-        raise InputError(f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file")
+        raise InputError(
+            f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy "
+            "file"
+        )
     with atomic_write(path) as file:
         file.write(content)
 
 
 def _with_sorted_metadata(content: bytes) -> bytes:
-    """The same file with its metadata sorted, so that equal policies are equal files: safetensors' order is random."""
+    """The same file with its metadata sorted, so that equal policies are equal files: safetensors'
+    order is random."""
     size = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -49,24 +56,34 @@ def _with_sorted_metadata(content: bytes) -> bytes:
 
 
 def load_policy(path: str | Path) -> LearnedPolicy:
-    """Reads a policy file. Raises InputError: unreadable, no policy, or weights of another configuration."""
+    """Reads a policy file. Raises InputError: unreadable, no policy, or weights of another
+    configuration."""
     tensors, metadata = _read(Path(path))
     if metadata.get("format") != FORMAT:
-        raise InputError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")
+        raise InputError(
+            f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})"
+        )
     try:
         config = read(AgentConfig, json.loads(metadata["agent"]))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be used by this version: {error}") from None
     count = len(tensors) // 2
     try:
-        layers = tuple(Layer(tensors[f"layer{k}.kernel"], tensors[f"layer{k}.bias"]) for k in range(count))
+        layers = tuple(
+            Layer(tensors[f"layer{k}.kernel"], tensors[f"layer{k}.bias"]) for k in range(count)
+        )
     except KeyError as error:
         raise InputError(f"{path}: {error} is missing") from None
     size = observation_size(config)
     for k, layer in enumerate(layers):
-        if layer.kernel.ndim != 2 or layer.kernel.shape[0] != size or layer.bias.shape != layer.kernel.shape[1:]:
+        if (
+            layer.kernel.ndim != 2
+            or layer.kernel.shape[0] != size
+            or layer.bias.shape != layer.kernel.shape[1:]
+        ):
             raise InputError(
-                f"{path}: layer {k} has the shape {layer.kernel.shape}, which does not take {size} numbers "
+                f"{path}: layer {k} has the shape {layer.kernel.shape}, which does not take {size} "
+                "numbers "
                 f"(observation {config.observation!r}, history {config.history})"
             )
         if layer.kernel.dtype != np.float32 or layer.bias.dtype != np.float32:

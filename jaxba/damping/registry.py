@@ -19,11 +19,21 @@ from jaxba.damping.default_policy import Guarded
 from jaxba.damping.learned import LearnedPolicy, always
 from jaxba.damping.policy import DampingPolicy, check_policy
 from jaxba.damping.policy_file import load_policy
-from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
+from jaxba.damping.rules import (
+    Ceres,
+    Classic,
+    Schedule,
+    gauss_newton,
+    gtsam,
+    nielsen,
+    stba,
+    theseus,
+)
 from jaxba.problem.checks import shown
 from jaxba.typing import InputError
 
-LEARNED, BOLD = "learned", "bold"  # the shipped network, for lambda alone, and the guard of agents without a network
+# the shipped network, for lambda alone, and the guard of agents without a network
+LEARNED, BOLD = "learned", "bold"
 GUARDED = "guarded"  # the default policy of a solve
 
 SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
@@ -31,12 +41,16 @@ SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"
 
 
 def bold() -> LearnedPolicy:
-    """The smallest lambda that the guard of agents allows, in every iteration, and all embedded iterations."""
+    """The smallest lambda that the guard of agents allows, in every iteration, and all embedded
+    iterations."""
     return always(-1.0, embedded())
 
 
 POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
-    "ceres": (Ceres, "Ceres' trust-region rule: x1/3 to x2 by gain ratio, x2, x4, ... after rejections"),
+    "ceres": (
+        Ceres,
+        "Ceres' trust-region rule: x1/3 to x2 by gain ratio, x2, x4, ... after rejections",
+    ),
     "classic": (Classic, "the paper's baseline: 1/4, then x1/2 after a good step, x2 otherwise"),
     "gtsam": (gtsam, "GTSAM's legacy rule: 1e-5, then x1/10 or x10"),
     "nielsen": (nielsen, "g2o's rule: 1e-5, as Ceres' but always shrinking after success"),
@@ -44,8 +58,14 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "theseus": (theseus, "Theseus' adaptive rule: 1e-3, then x1/9 or x11"),
     "schedule": (Schedule, "the paper's cycle 1e-15, 1e-15, 0.194, 0.551"),
     "gauss-newton": (gauss_newton, "next to no damping: 1e-10 throughout"),
-    GUARDED: (Guarded, "1e-6, then 1e-8, raised by half a decade after a failure; Ceres' rule after two in a row"),
-    BOLD: (bold, "the smallest lambda that the guard of agents allows: 1e-5, then /32 down to 1e-9"),
+    GUARDED: (
+        Guarded,
+        "1e-6, then 1e-8, raised by half a decade after a failure; Ceres' rule after two in a row",
+    ),
+    BOLD: (
+        bold,
+        "the smallest lambda that the guard of agents allows: 1e-5, then /32 down to 1e-9",
+    ),
 }
 """Factory and one line of description by name."""
 
@@ -55,9 +75,10 @@ CONSTANT = "constant"  # prefix of `constant:VALUE`
 
 
 def make_policy(name: str) -> DampingPolicy:
-    """The policy called `name`: `learned`; the path of a policy file; `FILE.py:CLASS`, for which the file is run; a key
-    of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; or `constant:LAMBDA`. Raises InputError: no such
-    policy, a lambda that is not a positive number, or a path that is not of a policy file."""
+    """The policy called `name`: `learned`; the path of a policy file; `FILE.py:CLASS`, for which
+    the file is run; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; or
+    `constant:LAMBDA`. Raises InputError: no such policy, a lambda that is not a positive number, or
+    a path that is not of a policy file."""
     if not isinstance(name, str):
         raise InputError(f"the name of a policy must be a text, not {shown(name)}")
     if re.fullmatch(OWN, name):
@@ -69,7 +90,8 @@ def make_policy(name: str) -> DampingPolicy:
         return Schedule(values=(_damping(name, number),))
     if "+" in base:
         raise InputError(
-            f"unknown damping policy {name!r}: its name has no '+'; the method and embedded iterations are options"
+            f"unknown damping policy {name!r}: its name has no '+'; the method and embedded "
+            "iterations are options"
         )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}", "FILE.py:CLASS"])
@@ -130,7 +152,8 @@ def fault(error: Exception, path: str) -> str:
 
 
 def brings_step(name: str) -> bool:
-    """Whether a policy of this name brings a step of its own, with embedded iterations or without."""
+    """Whether a policy of this name brings a step of its own, with embedded iterations or
+    without."""
     if re.fullmatch(OWN, name):
         return hasattr(make_policy(name), "step_options")
     return is_learned(name) or name.partition(":")[0] in (BOLD, GUARDED)

@@ -17,7 +17,9 @@ from jaxba.lm.records import StepInfo
 from jaxba.typing import register_pytree
 
 LARGEST = 1e32  # upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32
-SMALLEST = 1e-30  # lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow again
+# lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow
+# again
+SMALLEST = 1e-30
 
 
 def _scalar(value: Any, info: ProblemInfo) -> Array:
@@ -29,8 +31,10 @@ def _scalar(value: Any, info: ProblemInfo) -> Array:
 class Ceres:
     """Ceres' trust-region rule with radius 1 / lambda.
 
-    Accepted with gain `rho`: lambda times `clip(1 - (2 rho - 1)^3, 1/3, upper)`; rejected: times 2, 4, 8 ...
-    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section 3.2)."""
+    Accepted with gain `rho`: lambda times `clip(1 - (2 rho - 1)^3, 1/3, upper)`; rejected: times 2,
+    4, 8 ...
+    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section
+    3.2)."""
 
     initial: float = 1e-4
     """First lambda. Source: Ceres initial_trust_region_radius 1e4."""
@@ -51,11 +55,19 @@ class Ceres:
     """Source: Ceres min_relative_decrease."""
 
     relative: float = 0.0
-    """1 where `initial` counts in units of the largest Hessian entry under identity scaling (g2o)."""
+    """1 where `initial` counts in units of the largest Hessian entry under identity scaling
+    (g2o)."""
 
-    def factor(self, accepted: Bool[Array, ""], gain: Float[Array, ""], growth: Float[Array, ""]) -> Float[Array, ""]:
-        """Factor on lambda after a step with this gain ratio, or after a rejected one, whose factor is `growth`."""
-        return jnp.where(accepted, jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling), growth)
+    def factor(
+        self, accepted: Bool[Array, ""], gain: Float[Array, ""], growth: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """Factor on lambda after a step with this gain ratio, or after a rejected one, whose factor
+        is `growth`."""
+        return jnp.where(
+            accepted,
+            jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling),
+            growth,
+        )
 
     def init(self, info: ProblemInfo) -> tuple[Array, Array]:
         """See `DampingPolicy`. The state is the factor after the next rejection."""
@@ -72,8 +84,8 @@ class Ceres:
 def nielsen() -> Ceres:
     """g2o's rule: as Ceres', but an accepted step always shrinks lambda (factor in [1/3, 2/3]).
 
-    Source: g2o optimization_algorithm_levenberg.cpp: first lambda 1e-5 times the largest Hessian diagonal, which
-    under diagonal scaling is 1e-5 itself; any decrease is accepted."""
+    Source: g2o optimization_algorithm_levenberg.cpp: first lambda 1e-5 times the largest Hessian
+    diagonal, which under diagonal scaling is 1e-5 itself; any decrease is accepted."""
     return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=SMALLEST, relative=1.0)
 
 
@@ -119,9 +131,9 @@ class Geometric:
 class Classic(Geometric):
     """The paper's baseline: halve after a good step, double otherwise.
 
-    Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain threshold
-    0.4 as in the authors' released code, since the printed text swaps them. A step that lowers the cost is
-    always accepted."""
+    Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain
+    threshold 0.4 as in the authors' released code, since the printed text swaps them. A step that
+    lowers the cost is always accepted."""
 
     initial: float = 0.25
     success: float = 0.5
@@ -132,18 +144,23 @@ class Classic(Geometric):
 
 
 def gtsam() -> Geometric:
-    """GTSAM's legacy rule: divide by 10, multiply by 10, lambda in [0, 1e5]. Source: LevenbergMarquardtParams."""
+    """GTSAM's legacy rule: divide by 10, multiply by 10, lambda in [0, 1e5]. Source:
+    LevenbergMarquardtParams."""
     return Geometric(initial=1e-5, success=0.1, failure=10.0, minimum=SMALLEST, maximum=1e5)
 
 
 def stba() -> Geometric:
-    """STBA's rule: divide by 3, multiply by 3. Source: Zhou et al. 2020, authors' main branch (radius 1e4)."""
+    """STBA's rule: divide by 3, multiply by 3. Source: Zhou et al. 2020, authors' main branch
+    (radius 1e4)."""
     return Geometric(initial=1e-4, success=1 / 3, failure=3.0, minimum=SMALLEST, maximum=LARGEST)
 
 
 def theseus() -> Geometric:
-    """Theseus' adaptive rule: divide by 9, multiply by 11, lambda in [1e-7, 1e7]; accepts gains above 0.1."""
-    return Geometric(initial=1e-3, success=1 / 9, failure=11.0, minimum=1e-7, maximum=1e7, min_gain=0.1)
+    """Theseus' adaptive rule: divide by 9, multiply by 11, lambda in [1e-7, 1e7]; accepts gains
+    above 0.1."""
+    return Geometric(
+        initial=1e-3, success=1 / 9, failure=11.0, minimum=1e-7, maximum=1e7, min_gain=0.1
+    )
 
 
 @register_pytree
@@ -151,7 +168,8 @@ def theseus() -> Geometric:
 class Schedule:
     """Repeats a list of lambdas whatever happens; a list of one is a constant.
 
-    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors' agent."""
+    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors'
+    agent."""
 
     values: tuple[float, ...] = (1e-15, 1e-15, 0.194, 0.551)
     """Lambdas, in order."""
@@ -170,7 +188,9 @@ class Schedule:
 
 
 def gauss_newton() -> Schedule:
-    """Next to no damping. The seven gauge freedoms make the undamped system singular, so lambda is 1e-10.
+    """Next to no damping. The seven gauge freedoms make the undamped system singular, so lambda is
+    1e-10.
 
-    Under diagonal scaling this changes no direction that the observations determine by more than 1e-10."""
+    Under diagonal scaling this changes no direction that the observations determine by more than
+    1e-10."""
     return Schedule(values=(1e-10,))

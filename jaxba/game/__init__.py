@@ -1,1 +1,2 @@
-"""The game of bundle adjustment: a vectorised environment over the LM step, its scenes, and the scores of policies."""
+"""The game of bundle adjustment: a vectorised environment over the LM step, its scenes, and the
+scores of policies."""

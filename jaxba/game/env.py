@@ -1,11 +1,12 @@
-"""The game: bundle adjustment as a vectorised environment. A step is one LM iteration of every scene.
+"""The game: bundle adjustment as a vectorised environment. A step is one LM iteration of every
+scene.
 
 | | |
 | --- | --- |
 | state | a scene of the bank, its current cameras and points, the agent's memory of the episode |
 | observation | `damping.features.observe`; critics also see the distance to the best known cost |
 | action | a number in (-1, 1): lambda by `damping.guard.damping_of` |
-| terminated | accepted cost within `tolerance` of the best known cost, or the limit, as in the paper |
+| terminated | accepted cost within `tolerance` of the best known one, or limit, as in the paper |
 | truncated | never |
 | reward | `GameConfig.reward` |
 
@@ -42,10 +43,13 @@ from jaxba.typing import register_pytree
 Reward = Literal["constant", "clock", "reduction", "reversed"]
 
 RewardFunction = Callable[[StepInfo, Array, Array], Array]
-"""Of an iteration, the best known cost of the scene, and whether the episode has ended in success."""
+"""Of an iteration, the best known cost of the scene, and whether the episode has ended in
+success."""
 
-DISTANCE_FLOOR = 1e-6  # relative distance to the best known cost that a critic does not distinguish from zero
-BONUS_DECAY = 0.01  # fraction of the bonus lost in an iteration under `reduction`. Source: Belder et al. 2023
+# relative distance to the best known cost that a critic does not distinguish from zero
+DISTANCE_FLOOR = 1e-6
+# fraction of the bonus lost in an iteration under `reduction`. Source: Belder et al. 2023
+BONUS_DECAY = 0.01
 
 
 @dataclass(frozen=True)
@@ -56,10 +60,11 @@ class GameConfig:
     """What the agent observes and decides."""
 
     reward: Reward | RewardFunction = "constant"
-    """Of an iteration: a function, or a name. `constant`: -1. `clock`: minus its duration by a clock, which varies as
-    measured ones do. `reduction`: zero, and the bonus shrinks with every iteration. `reversed`: minus log10 of the cost
-    over the best known cost (the paper's reversed roles of state and reward). Bonus and scale are those of a name; a
-    function's number is the whole reward."""
+    """Of an iteration: a function, or a name. `constant`: -1. `clock`: minus its duration by a
+    clock, which varies as measured ones do. `reduction`: zero, and the bonus shrinks with every
+    iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's reversed
+    roles of state and reward). Bonus and scale are those of a name; a function's number is the
+    whole reward."""
 
     bonus: float = 10.0
     """Added if the episode ends in success. Source: Belder et al. 2023."""
@@ -81,20 +86,27 @@ class GameConfig:
         if not (self.max_iterations >= 1 and self.tolerance > 0 and self.scale > 0):
             raise ValueError("max_iterations, tolerance and scale must be positive")
         if not self.tolerance < 1:
-            raise ValueError(f"tolerance must be below 1, is {self.tolerance}: starts would be successes")
+            raise ValueError(
+                f"tolerance must be below 1, is {self.tolerance}: starts would be successes"
+            )
         if not self.bonus >= 0:
             raise ValueError(f"bonus must not be negative, is {self.bonus}")
 
 
 def _check_reward(reward: RewardFunction) -> None:
-    """Traces a user's reward. Raises ValueError: it cannot be traced, or returns anything but one number."""
+    """Traces a user's reward. Raises ValueError: it cannot be traced, or returns anything but one
+    number."""
     scalar = lambda kind: jax.ShapeDtypeStruct((), kind)
     step = StepInfo._make(scalar(KINDS.get(name, jnp.float32)) for name in StepInfo._fields)
     try:
-        found = jax.eval_shape(lambda *of: jnp.asarray(reward(*of)), step, scalar(jnp.float32), scalar(bool))
+        found = jax.eval_shape(
+            lambda *of: jnp.asarray(reward(*of)), step, scalar(jnp.float32), scalar(bool)
+        )
     except Exception as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"the reward is no function of (step, best, success) that JAX can trace: {reason}") from error
+        raise ValueError(
+            f"the reward is no function of (step, best, success) that JAX can trace: {reason}"
+        ) from error
     if found.shape:
         raise ValueError(f"the reward must be one number, not an array of shape {found.shape}")
 
@@ -154,7 +166,9 @@ class Game:
         """New episodes everywhere."""
         check_x64(self.bank.initial_cost.dtype)
         key, own = jax.random.split(key)
-        episodes = jax.vmap(functools.partial(self._fresh, self.bank))(jax.random.split(own, self.num_envs))
+        episodes = jax.vmap(functools.partial(self._fresh, self.bank))(
+            jax.random.split(own, self.num_envs)
+        )
         state = GameState(episodes, key)
         return state, self.observations(state)
 
@@ -174,22 +188,32 @@ class Game:
 
     def start(self, bank: Bank, scene: Int[Array, ""]) -> Episode:
         """The episode of one scene before its first iteration."""
-        scenes, initial, info = jax.tree.map(lambda x: x[scene], (bank.scenes, bank.initial_cost, bank.info))
+        scenes, initial, info = jax.tree.map(
+            lambda x: x[scene], (bank.scenes, bank.initial_cost, bank.info)
+        )
         info = info._replace(max_iterations=jnp.asarray(self.config.max_iterations, jnp.int32))
         state = LMState(scenes.cameras, scenes.points, initial)
         return Episode(scene, state, begin(self.config.agent, info))
 
-    def iterate(self, bank: Bank, episode: Episode, action: Float[Array, " actions"]) -> tuple[Episode, StepInfo]:
+    def iterate(
+        self, bank: Bank, episode: Episode, action: Float[Array, " actions"]
+    ) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
         agent, memory = self.config.agent, episode.memory
         layout = class_layout(self.kind, self.options)
-        layout = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
+        layout = with_scene(
+            layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene]
+        )
         damping = damping_of(agent, memory.guard, action[0])
-        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, memory.iteration)
+        state, step = lm_step(
+            layout, episode.state, damping, self.options, agent.min_gain, memory.iteration
+        )
         return Episode(episode.scene, state, record(agent, memory, step)), step
 
     @for_traces
-    def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
+    def step(
+        self, state: GameState, action: Float[Array, "envs actions"]
+    ) -> tuple[GameState, Step]:
         """Plays one action everywhere. Raises ValueError: actions of another shape."""
         check_x64(self.bank.initial_cost.dtype)
         if (expected := (self.num_envs, self.action_size)) != (shape := jnp.shape(action)):
@@ -199,7 +223,9 @@ class Game:
         episodes, step = step_groups(self._play, state.episodes, action, keys, shared=self.bank)
         return GameState(episodes, key), step
 
-    def _play(self, bank: Bank, episode: Episode, action: Array, key: Array) -> tuple[Episode, Step]:
+    def _play(
+        self, bank: Bank, episode: Episode, action: Array, key: Array
+    ) -> tuple[Episode, Step]:
         rules = self.config
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(bank, episode, action)
@@ -213,13 +239,19 @@ class Game:
             "length": single(after.memory.iteration),
             "success": single(success),
             "rejections": single(after.memory.guard.rescue.rejections),
-            "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
+            "ceres": single(
+                jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)
+            ),
         }
         observed = functools.partial(self._observe, bank)
         never = jnp.zeros_like(terminated)
-        return following, Step(observed(following), single(reward), terminated, never, observed(after), metrics)
+        return following, Step(
+            observed(following), single(reward), terminated, never, observed(after), metrics
+        )
 
-    def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
+    def _reward(
+        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]
+    ) -> Array:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if callable(rules.reward):
@@ -236,10 +268,15 @@ class Game:
 
     @for_traces
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
-        """Uniform actions in half of the environments; Ceres' rule in a quarter, a hundredth of it in the last one."""
+        """Uniform actions in half of the environments; Ceres' rule in a quarter, a hundredth of it
+        in the last one."""
         agent = self.config.agent
-        uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        rule = jax.vmap(_rule_damping)(state.episodes.memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        uniform = jax.random.uniform(
+            key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0
+        )
+        rule = jax.vmap(_rule_damping)(state.episodes.memory) - 2.0 * (
+            jnp.arange(self.num_envs) % 4 == 3
+        )
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
@@ -253,10 +290,15 @@ def _rule_damping(memory: Memory) -> Array:
 
 
 def make_game(
-    config: GameConfig, kind: SceneClass, bank: Bank, num_envs: int, options: StepOptions | None = None
+    config: GameConfig,
+    kind: SceneClass,
+    bank: Bank,
+    num_envs: int,
+    options: StepOptions | None = None,
 ) -> Game:
-    """A game on a bank of scenes of the class `kind`, with the rules of `config` and so many environments. The agent's
-    configuration overrides the `options` of the LM step (`AgentConfig.step_options`)."""
+    """A game on a bank of scenes of the class `kind`, with the rules of `config` and so many
+    environments. The agent's configuration overrides the `options` of the LM step
+    (`AgentConfig.step_options`)."""
     options = config.agent.step_options(options or StepOptions())
     class_layout(kind, options)  # cached on the host before anything is traced
     return Game(bank, kind, num_envs, config, options)

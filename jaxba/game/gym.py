@@ -1,6 +1,7 @@
 """The game as Gymnasium environments, for trainers that speak NumPy. Needs the extra `gym`.
 
-`GymVectorGame` steps all scenes in one compiled call and resets those that ended; `GymGame` has one scene."""
+`GymVectorGame` steps all scenes in one compiled call and resets those that ended; `GymGame` has one
+scene."""
 
 from __future__ import annotations
 
@@ -33,8 +34,11 @@ _step = jit(lambda game, state, action: game.step(state, action))
 
 
 @jit
-def _step_or_begin(game: Game, state: GameState, action: jax.Array, begins: jax.Array) -> tuple[GameState, Step]:
-    """A step where episodes end in their own last observation, and those that begin have their first, and no step.
+def _step_or_begin(
+    game: Game, state: GameState, action: jax.Array, begins: jax.Array
+) -> tuple[GameState, Step]:
+    """A step where episodes end in their own last observation, and those that begin have their
+    first, and no step.
 
     Args:
         game: the game; its own step begins the next episode where one ended.
@@ -54,22 +58,27 @@ def _step_or_begin(game: Game, state: GameState, action: jax.Array, begins: jax.
 
 
 class GymVectorGame(gymnasium.vector.VectorEnv):
-    """All scenes of a game. Where an episode ends, another begins: in the next step, which then plays no action, or in
-    the same one.
+    """All scenes of a game. Where an episode ends, another begins: in the next step, which then
+    plays no action, or in the same one.
 
-    For each episode that ended, `infos` has its metrics: `length`, `success`, `rejections`, and `ceres`, the iterations
-    that Ceres' rule takes. With resets in the same step they are in `final_info`, and the last observation in
-    `final_obs`, as Gymnasium has it."""
+    For each episode that ended, `infos` has its metrics: `length`, `success`, `rejections`, and
+    `ceres`, the iterations that Ceres' rule takes. With resets in the same step they are in
+    `final_info`, and the last observation in `final_obs`, as Gymnasium has it."""
 
-    def __init__(self, game: Game, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP) -> None:
+    def __init__(
+        self, game: Game, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP
+    ) -> None:
         """Random numbers are seeded by the operating system until `reset` is given a seed.
 
-        `autoreset_mode`: `NextStep`, Gymnasium's default, which its wrappers ask for, or `SameStep`. Raises ValueError:
-        another one."""
+        `autoreset_mode`: `NextStep`, Gymnasium's default, which its wrappers ask for, or
+        `SameStep`. Raises ValueError: another one."""
         modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
         if autoreset_mode not in [*modes, *(mode.value for mode in modes)]:
             names = " or ".join(mode.value for mode in modes)
-            raise ValueError(f"autoreset_mode must be {names}, is {getattr(autoreset_mode, 'value', autoreset_mode)}")
+            raise ValueError(
+                f"autoreset_mode must be {names}, is "
+                f"{getattr(autoreset_mode, 'value', autoreset_mode)}"
+            )
         self._next_step = AutoresetMode(autoreset_mode) == AutoresetMode.NEXT_STEP
         self._begins = np.zeros(game.num_envs, bool)  # where an episode ended in the last step
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
@@ -86,19 +95,24 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """New episodes everywhere. `seed` is that of all random numbers from now on; if None, the current sequence
-        continues. Raises ValueError: options, which are not known."""
+        """New episodes everywhere. `seed` is that of all random numbers from now on; if None, the
+        current sequence continues. Raises ValueError: options, which are not known."""
         if options:
             raise ValueError(f"reset has no options, is given {', '.join(options)}")
         super().reset(seed=seed)
         game = self._opened()
         self._begins[:] = False
         with numerics(game.bank.initial_cost.dtype, single_blas=False):
-            self._state, observation = _reset(game, jax.random.key(int(self.np_random.integers(2**31))))
+            self._state, observation = _reset(
+                game, jax.random.key(int(self.np_random.integers(2**31)))
+            )
             return np.array(observation[:, : self._features]), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One iteration of every scene, with a row of `actions` for each; numbers outside of [-1, 1] are clipped."""
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One iteration of every scene, with a row of `actions` for each; numbers outside of [-1,
+        1] are clipped."""
         game = self._opened()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
@@ -139,15 +153,21 @@ class GymGame(gymnasium.Env):
     def __init__(self, game: Game) -> None:
         """The game has a single environment."""
         if game.num_envs != 1:
-            raise ValueError(f"a GymGame needs a game with one environment, this one has {game.num_envs}")
+            raise ValueError(
+                f"a GymGame needs a game with one environment, this one has {game.num_envs}"
+            )
         self._one = GymVectorGame(game, AutoresetMode.SAME_STEP)
-        self.observation_space, self.action_space = self._one.single_observation_space, self._one.single_action_space
+        self.observation_space, self.action_space = (
+            self._one.single_observation_space,
+            self._one.single_action_space,
+        )
         self._running = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A new episode. `seed` is of all random numbers from now on; None goes on with the sequence."""
+        """A new episode. `seed` is of all random numbers from now on; None goes on with the
+        sequence."""
         super().reset(seed=seed)
         observation, info = self._one.reset(seed=seed)
         self._running = True
@@ -163,7 +183,11 @@ class GymGame(gymnasium.Env):
         self._running = not (terminated or truncated)
         if not self._running:
             observation = infos["final_obs"]
-            infos = {name: float(x[0]) for name, x in infos["final_info"].items() if not name.startswith("_")}
+            infos = {
+                name: float(x[0])
+                for name, x in infos["final_info"].items()
+                if not name.startswith("_")
+            }
         return observation[0], float(reward[0]), bool(terminated), bool(truncated), infos
 
     def close(self) -> None:
@@ -181,8 +205,8 @@ def _actions(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
 
 
 def _metrics(step: Step, done: np.ndarray) -> dict[str, Any]:
-    """Metrics of the episodes that ended, as gymnasium's own vector environments have them: an array per name, and the
-    mask of its entries as `_name`."""
+    """Metrics of the episodes that ended, as gymnasium's own vector environments have them: an
+    array per name, and the mask of its entries as `_name`."""
     metrics: dict[str, Any] = {}
     if done.any():
         for name, values in step.metrics.items():
@@ -191,11 +215,17 @@ def _metrics(step: Step, done: np.ndarray) -> dict[str, Any]:
 
 
 def _infos(step: Step, observation: np.ndarray, done: np.ndarray) -> dict[str, Any]:
-    """The metrics and last observations of the episodes that ended, where others began in the same step."""
+    """The metrics and last observations of the episodes that ended, where others began in the same
+    step."""
     if not done.any():
         return {}
     last = np.full(len(done), None, dtype=object)
     for k in np.flatnonzero(done):
         last[k] = observation[k].copy()
     metrics = _metrics(step, done)
-    return {"final_obs": last, "_final_obs": done.copy(), "final_info": metrics, "_final_info": done.copy()}
+    return {
+        "final_obs": last,
+        "_final_obs": done.copy(),
+        "final_info": metrics,
+        "_final_info": done.copy(),
+    }

@@ -48,7 +48,8 @@ class Environment(Protocol):
 
     @property
     def privileged_size(self) -> int:
-        """How many of these features, the last ones, only critics see in training: a policy will not have them."""
+        """How many of these features, the last ones, only critics see in training: a policy will
+        not have them."""
         ...
 
     @property
@@ -57,7 +58,8 @@ class Environment(Protocol):
         ...
 
     def reset(self, key: Array) -> tuple[Any, Float[Array, "envs features"]]:
-        """State and observations of new episodes. The state holds the key of all further random numbers."""
+        """State and observations of new episodes. The state holds the key of all further random
+        numbers."""
         ...
 
     def step(self, state: Any, action: Float[Array, "envs actions"]) -> tuple[Any, Step]:

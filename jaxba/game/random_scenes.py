@@ -1,9 +1,9 @@
 """Scenes for the game, made by one compiled program: thousands of small problems of equal shape.
 
-Scenes of one *class* share a shape: at most C cameras and P points, an observation slot for every pair of a camera and
-a point, and a mask of the pairs that are observed. Smaller scenes leave cameras and points unobserved. Size, motion,
-depth, noise, wrong matches and the error of the start are drawn per scene; `SceneFamily` says from which distributions.
-"""
+Scenes of one *class* share a shape: at most C cameras and P points, an observation slot for every
+pair of a camera and a point, and a mask of the pairs that are observed. Smaller scenes leave
+cameras and points unobserved. Size, motion, depth, noise, wrong matches and the error of the start
+are drawn per scene; `SceneFamily` says from which distributions."""
 
 from __future__ import annotations
 
@@ -24,31 +24,35 @@ from jaxba.structure.density import DENSE_UNKNOWNS
 from jaxba.structure.track_buckets import TILED_POINTS
 
 SceneFamily = Literal["wide", "paper", "windows"]
-"""`wide`: all motions, depths, noises and starts below. `paper`: random cameras that all see all random
-points. `windows`: not random, but cut from real problems (game/windows.py)."""
+"""`wide`: all motions, depths, noises and starts below. `paper`: random cameras that all see all
+random points. `windows`: not random, but cut from real problems (game/windows.py)."""
 
-MOTIONS = ("forward", "lateral", "orbit", "photos")  # motions of the cameras of a wide scene, equally often
+# motions of the cameras of a wide scene, equally often
+MOTIONS = ("forward", "lateral", "orbit", "photos")
 MIN_VIEWS = 5  # cameras with fewer observations are removed: nine unknowns need five observations
 NOISE = (0.05, 3.0)  # sigma of a measurement in pixels, log-uniform per scene
-OUTLIERS = (0.4, 1e-3, 0.03)  # fraction of scenes with wrong matches; smallest and largest fraction of these in them
+# fraction of scenes with wrong matches; smallest and largest fraction of these in them
+OUTLIERS = (0.4, 1e-3, 0.03)
 OUTLIER_ERROR = (5.0, 100.0)  # largest error of a wrong match in pixels, log-uniform per scene
 FOCAL = (300.0, 4000.0)  # focal length in pixels, log-uniform per scene
 CANDIDATES = 3  # points drawn per point that is kept, since many are seen by one camera only
 
 START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.25)
-"""Sigmas of the error of the start, log-uniform per scene: rotations in radians, centres in units of the distance of
-neighbouring cameras, depths of points relative to the true ones."""
+"""Sigmas of the error of the start, log-uniform per scene: rotations in radians, centres in units
+of the distance of neighbouring cameras, depths of points relative to the true ones."""
 
 PAPER_START = (0.2, 2.0, 2.0)
-"""Sigmas of the error of the start of a scene of the family `paper`: rotations in radians, camera centres and points in
-lengths, where points fill a cube of side 4. Chosen so that lambda matters: on 790 usable scenes of 10 x 10
-Gauss-Newton takes 7 iterations to convergence in the median and fails on 6%, Ceres' rule takes 8.1 in the mean."""
+"""Sigmas of the error of the start of a scene of the family `paper`: rotations in radians, camera
+centres and points in lengths, where points fill a cube of side 4. Chosen so that lambda matters: on
+790 usable scenes of 10 x 10 Gauss-Newton takes 7 iterations to convergence in the median and fails
+on 6%, Ceres' rule takes 8.1 in the mean."""
 
 
 MOST_CAMERAS, MOST_POINTS = DENSE_UNKNOWNS // 9, TILED_POINTS - 2
-"""Of a class, 56 and 510. Its scenes share the layout of one in which every camera sees every point: a single bucket of
-points, with slots ordered camera by camera, and a dense product that forms the reduced camera system. Layouts of larger
-problems have tiles and pairs; from which sizes on was measured on real problems."""
+"""Of a class, 56 and 510. Its scenes share the layout of one in which every camera sees every
+point: a single bucket of points, with slots ordered camera by camera, and a dense product that
+forms the reduced camera system. Layouts of larger problems have tiles and pairs; from which sizes
+on was measured on real problems."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +94,8 @@ class _Rig(NamedTuple):
 @for_traces
 @functools.partial(jit, once=True, static_argnames=("kind", "count"))
 def make_scenes(kind: SceneClass, key: Array, count: int) -> Scenes:
-    """Random scenes of the shape and family of `kind`, the unusable ones included; see `scene_bank.solve_scenes`. Not
-    of the family `windows`. The same key gives the same scenes."""
+    """Random scenes of the shape and family of `kind`, the unusable ones included; see
+    `scene_bank.solve_scenes`. Not of the family `windows`. The same key gives the same scenes."""
     check_x64("float64")
     one = _paper_scene if kind.family == "paper" else _wide_scene
     return lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)
@@ -114,7 +118,8 @@ def _turns(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
 
 
 def _path(motion: Array, key: Array, cameras: int) -> tuple[Array, Array]:
-    """Centres and viewing directions of a motion of `MOTIONS`; the distance of neighbours is the unit of length."""
+    """Centres and viewing directions of a motion of `MOTIONS`; the distance of neighbours is the
+    unit of length."""
     keys = iter(jax.random.split(key, 12))
     i = jnp.arange(cameras)
     bend = jax.random.uniform(next(keys), minval=-0.12, maxval=0.12)
@@ -141,10 +146,14 @@ def _path(motion: Array, key: Array, cameras: int) -> tuple[Array, Array]:
 
 def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     keys = iter(jax.random.split(key, 24))
-    uniform = lambda low, high, shape=(): jax.random.uniform(next(keys), shape, minval=low, maxval=high)
+    uniform = lambda low, high, shape=(): jax.random.uniform(
+        next(keys), shape, minval=low, maxval=high
+    )
     motion = jax.random.randint(next(keys), (), 0, len(MOTIONS))
     cameras = jnp.floor(_log_uniform(next(keys), 4.0, kind.cameras + 1.0)).astype(int)
-    points = jnp.floor(_log_uniform(next(keys), max(10.0, float(kind.points // 4)), kind.points + 1.0)).astype(int)
+    points = jnp.floor(
+        _log_uniform(next(keys), max(10.0, float(kind.points // 4)), kind.points + 1.0)
+    ).astype(int)
     used = jnp.arange(kind.cameras) < cameras
 
     center, forward = _path(motion, next(keys), kind.cameras)
@@ -152,7 +161,8 @@ def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     focal = _log_uniform(next(keys), *FOCAL) * jnp.exp(
         jnp.where(motion == 3, 0.25, 0.0) * jax.random.normal(next(keys), (kind.cameras,))
     )
-    half = jax.random.uniform(next(keys), (2,), minval=0.15, maxval=0.9)  # tangents of half the angles of view
+    # tangents of half the angles of view
+    half = jax.random.uniform(next(keys), (2,), minval=0.15, maxval=0.9)
     square = jnp.sum(half**2)
     distorted = jax.random.bernoulli(next(keys), 0.7)
     k1 = distorted * uniform(-0.2, 0.1) / square
@@ -161,8 +171,11 @@ def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     rig = _Rig(_look_at(forward, up), center, lens)
 
     reference, world = _points(kind, rig, motion, cameras, half, next(keys))
-    seen = _visible(rig, world, half) & used[:, None] & _matched(kind, motion, reference, next(keys))
-    first = jnp.argsort(jnp.sum(seen, axis=0) < 2, stable=True)[: kind.points]  # tracks before single views
+    seen = (
+        _visible(rig, world, half) & used[:, None] & _matched(kind, motion, reference, next(keys))
+    )
+    # tracks before single views
+    first = jnp.argsort(jnp.sum(seen, axis=0) < 2, stable=True)[: kind.points]
     reference, world = reference[first], world[first]
     seen = _enough(seen[:, first] & (jnp.arange(kind.points) < points))
 
@@ -175,7 +188,8 @@ def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
 def _points(
     kind: SceneClass, rig: _Rig, motion: Array, cameras: Array, half: Array, key: Array
 ) -> tuple[Int[Array, " candidates"], Float[Array, "candidates 3"]]:
-    """Each point on a random ray of a random camera, at depths over up to two decades or around an object."""
+    """Each point on a random ray of a random camera, at depths over up to two decades or around an
+    object."""
     a, b, c, d, e = jax.random.split(key, 5)
     count = CANDIDATES * kind.points
     reference = jax.random.randint(a, (count,), 0, cameras)
@@ -187,17 +201,23 @@ def _points(
     around = focus * jnp.exp((along - 0.5) * jnp.minimum(jnp.log(spread), 1.5))
     depth = jnp.where(motion >= 2, around, near * spread**along)
     local = depth[:, None] * jnp.concatenate([ray, -jnp.ones((count, 1))], axis=1)
-    return reference, rig.center[reference] + jnp.einsum("nji,nj->ni", rig.rotation[reference], local)
+    return reference, rig.center[reference] + jnp.einsum(
+        "nji,nj->ni", rig.rotation[reference], local
+    )
 
 
 def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 cameras points"]:
     """Pixels of every point in every camera."""
     rotation = jnp.moveaxis(rig.rotation, 0, -1)[..., None]
-    frames = camera.Frames(rotation, _translation(rig.rotation, rig.center).T[..., None], rig.intrinsics[..., None])
+    frames = camera.Frames(
+        rotation, _translation(rig.rotation, rig.center).T[..., None], rig.intrinsics[..., None]
+    )
     return jnp.stack(list(camera.project(frames, world.T[:, None]).pixel))
 
 
-def _visible(rig: _Rig, world: Float[Array, "points 3"], half: Array) -> Bool[Array, "cameras points"]:
+def _visible(
+    rig: _Rig, world: Float[Array, "points 3"], half: Array
+) -> Bool[Array, "cameras points"]:
     """In front of the camera, not too close to it, and inside the image."""
     local = jnp.einsum("cij,cpj->cpi", rig.rotation, world - rig.center[:, None])
     depth = -local[..., 2]
@@ -205,8 +225,11 @@ def _visible(rig: _Rig, world: Float[Array, "points 3"], half: Array) -> Bool[Ar
     return (depth > 0.3) & inside
 
 
-def _matched(kind: SceneClass, motion: Array, reference: Array, key: Array) -> Bool[Array, "cameras _"]:
-    """Which of the possible views are matched: tracks of random length along a path, random views of photos."""
+def _matched(
+    kind: SceneClass, motion: Array, reference: Array, key: Array
+) -> Bool[Array, "cameras _"]:
+    """Which of the possible views are matched: tracks of random length along a path, random views
+    of photos."""
     a, b, c, d = jax.random.split(key, 4)
     window = _log_uniform(a, 1.0, float(kind.cameras))
     reach = jnp.maximum(1.0, window * _log_uniform(b, 0.5, 2.0, reference.shape))
@@ -217,7 +240,8 @@ def _matched(kind: SceneClass, motion: Array, reference: Array, key: Array) -> B
 
 
 def _enough(seen: Bool[Array, "cameras points"]) -> Bool[Array, "cameras points"]:
-    """Repeatedly removes points that one camera sees and cameras with fewer than `MIN_VIEWS` observations."""
+    """Repeatedly removes points that one camera sees and cameras with fewer than `MIN_VIEWS`
+    observations."""
 
     def prune(_: Array, seen: Array) -> Array:
         seen = seen & (jnp.sum(seen, axis=0) >= 2)
@@ -227,22 +251,33 @@ def _enough(seen: Bool[Array, "cameras points"]) -> Bool[Array, "cameras points"
     return seen & (jnp.sum(seen, axis=0) >= 2)
 
 
-def _measure(rig: _Rig, world: Array, noise: Array, wrong: Array, key: Array) -> Float[Array, "2 cameras points"]:
+def _measure(
+    rig: _Rig, world: Array, noise: Array, wrong: Array, key: Array
+) -> Float[Array, "2 cameras points"]:
     a, b, c, d = jax.random.split(key, 4)
     pixels = _project(rig, world)
     pixels = pixels + noise * jax.random.normal(a, pixels.shape)
-    moved = _log_uniform(b, *OUTLIER_ERROR) * jax.random.uniform(c, pixels.shape, minval=-1.0, maxval=1.0)
+    moved = _log_uniform(b, *OUTLIER_ERROR) * jax.random.uniform(
+        c, pixels.shape, minval=-1.0, maxval=1.0
+    )
     return pixels + moved * jax.random.bernoulli(d, wrong, pixels.shape[1:])
 
 
 def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[Array, Array]:
-    """Start with errors: drift along the path, independent errors of cameras and points, wrong lens, wrong depths."""
+    """Start with errors: drift along the path, independent errors of cameras and points, wrong
+    lens, wrong depths."""
     keys = iter(jax.random.split(key, 24))
     cameras = rig.center.shape[0]
-    sometimes = lambda chance, low, high: jax.random.bernoulli(next(keys), chance) * _log_uniform(next(keys), low, high)
-    turn = jnp.cumsum(sometimes(0.5, 1e-5, 0.02) * jax.random.normal(next(keys), (cameras, 3)), axis=0)
+    sometimes = lambda chance, low, high: (
+        jax.random.bernoulli(next(keys), chance) * _log_uniform(next(keys), low, high)
+    )
+    turn = jnp.cumsum(
+        sometimes(0.5, 1e-5, 0.02) * jax.random.normal(next(keys), (cameras, 3)), axis=0
+    )
     turns = _turns(turn)
-    pace = jnp.exp(jnp.cumsum(sometimes(0.3, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras, 1)), axis=0))
+    pace = jnp.exp(
+        jnp.cumsum(sometimes(0.3, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras, 1)), axis=0)
+    )
     steps = jnp.einsum("nij,nj->ni", turns[:-1], jnp.diff(rig.center, axis=0)) * pace[1:]
     moved = rig.center[0] + jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(steps, axis=0)])
     follow = jax.random.bernoulli(next(keys), 0.8)  # points made with the drifted cameras
@@ -251,14 +286,18 @@ def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[
     )
     points = jnp.where(follow, carried, world)
     ray = points - moved[reference]
-    depth = jnp.exp(_log_uniform(next(keys), *START_DEPTH) * jax.random.normal(next(keys), (len(points), 1)))
+    depth = jnp.exp(
+        _log_uniform(next(keys), *START_DEPTH) * jax.random.normal(next(keys), (len(points), 1))
+    )
     size = jnp.linalg.norm(ray, axis=1, keepdims=True)
     across = sometimes(0.7, 1e-5, 0.01) * size * jax.random.normal(next(keys), points.shape)
     points = moved[reference] + ray * depth + across
 
     noise = _log_uniform(next(keys), *START_ROTATION) * jax.random.normal(next(keys), (cameras, 3))
     rotation = _turns(noise) @ rig.rotation @ jnp.swapaxes(turns, 1, 2)
-    center = moved + _log_uniform(next(keys), *START_CENTER) * jax.random.normal(next(keys), moved.shape)
+    center = moved + _log_uniform(next(keys), *START_CENTER) * jax.random.normal(
+        next(keys), moved.shape
+    )
     common = sometimes(0.5, 0.01, 0.4) * jax.random.uniform(next(keys), minval=-1.0, maxval=1.0)
     individual = sometimes(0.5, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras,))
     flat = jax.random.bernoulli(next(keys), 0.6)
@@ -276,12 +315,14 @@ def _translation(rotation: Array, center: Array) -> Float[Array, "n 3"]:
 
 
 def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
-    """Random cameras around random points, all of which they see; focal length 500 pixels, noise of half a pixel.
+    """Random cameras around random points, all of which they see; focal length 500 pixels, noise of
+    half a pixel.
 
-    Source: the text of Belder et al. 2023, which draws points and camera poses at random and names no distribution:
-    here points in a cube, and cameras in all directions around it that look at a random place in it, with a random
-    roll. The noise is that of the paper's equation 1, without which the best cost would be zero and a relative
-    tolerance meaningless. The text does not say either how far off a start is (`PAPER_START`)."""
+    Source: the text of Belder et al. 2023, which draws points and camera poses at random and names
+    no distribution: here points in a cube, and cameras in all directions around it that look at a
+    random place in it, with a random roll. The noise is that of the paper's equation 1, without
+    which the best cost would be zero and a relative tolerance meaningless. The text does not say
+    either how far off a start is (`PAPER_START`)."""
     keys = iter(jax.random.split(key, 10))
     normal = lambda *shape: jax.random.normal(next(keys), shape)
     world = jax.random.uniform(next(keys), (kind.points, 3), minval=-2.0, maxval=2.0)
@@ -291,7 +332,9 @@ def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
     target = jax.random.uniform(next(keys), (kind.cameras, 3), minval=-1.0, maxval=1.0)
     rotation = _look_at(target - center, normal(kind.cameras, 3))
     lens = jnp.zeros((3, kind.cameras)).at[0].set(500.0)
-    pixels = _measure(_Rig(rotation, center, lens), world, jnp.asarray(0.5), jnp.asarray(0.0), next(keys))
+    pixels = _measure(
+        _Rig(rotation, center, lens), world, jnp.asarray(0.5), jnp.asarray(0.0), next(keys)
+    )
     turn, shift, move = PAPER_START
     turned = _turns(turn * normal(kind.cameras, 3)) @ rotation
     cameras = _camera_columns(turned, center + shift * normal(kind.cameras, 3), lens)
@@ -299,8 +342,11 @@ def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
     return _assemble(start, pixels, jnp.ones((kind.cameras, kind.points), bool))
 
 
-def _assemble(start: tuple[Array, Array], pixels: Array, seen: Bool[Array, "cameras points"]) -> Scenes:
-    """Observations in the order of the slots: camera by camera, the points of each, and an empty one at the end."""
+def _assemble(
+    start: tuple[Array, Array], pixels: Array, seen: Bool[Array, "cameras points"]
+) -> Scenes:
+    """Observations in the order of the slots: camera by camera, the points of each, and an empty
+    one at the end."""
     cameras, points = start
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, 1)])
     mask = pad(seen).reshape(-1)

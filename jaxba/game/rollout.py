@@ -1,7 +1,7 @@
 """Plays a damping policy on every scene of a bank, many at a time, each to its end.
 
-A compiled loop over lanes: when a scene ends, its lane starts the next one, so that no lane waits for the slowest
-scene."""
+A compiled loop over lanes: when a scene ends, its lane starts the next one, so that no lane waits
+for the slowest scene."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ from jaxba.typing import register_pytree
 @register_pytree
 @dataclass(frozen=True)
 class OneOf:
-    """Several policies as one, so that they share compiled programs: that of a number, which is traced, is asked."""
+    """Several policies as one, so that they share compiled programs: that of a number, which is
+    traced, is asked."""
 
     policies: tuple[Any, ...]
     number: Any
@@ -58,8 +59,11 @@ class OneOf:
         return lax.switch(self.number, asked, state)
 
 
-def alike(policies: Mapping[str, tuple[DampingPolicy, StepOptions]]) -> dict[str, tuple[DampingPolicy, StepOptions]]:
-    """Policies with their steps; those with equal steps have one structure, so that a function compiles once."""
+def alike(
+    policies: Mapping[str, tuple[DampingPolicy, StepOptions]],
+) -> dict[str, tuple[DampingPolicy, StepOptions]]:
+    """Policies with their steps; those with equal steps have one structure, so that a function
+    compiles once."""
     kinds: dict[StepOptions, dict[Hashable, DampingPolicy]] = {}
     for policy, options in policies.values():
         kinds.setdefault(options, {}).setdefault(_kind(policy), policy)
@@ -67,7 +71,10 @@ def alike(policies: Mapping[str, tuple[DampingPolicy, StepOptions]]) -> dict[str
     for name, (policy, options) in policies.items():
         same = kinds[options]
         number = list(same).index(_kind(policy))
-        one = OneOf(tuple(policy if k == number else x for k, x in enumerate(same.values())), jnp.asarray(number))
+        one = OneOf(
+            tuple(policy if k == number else x for k, x in enumerate(same.values())),
+            jnp.asarray(number),
+        )
         found[name] = (one if len(same) > 1 else policy), options
     return found
 
@@ -98,7 +105,12 @@ class Trajectories(NamedTuple):
 
 @for_traces
 def play(
-    kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: float = 1e-6
+    kind: SceneClass,
+    bank: Any,
+    policy: DampingPolicy,
+    options: StepOptions,
+    limit: int,
+    ftol: float = 1e-6,
 ) -> Trajectories:
     """Solves every scene of the bank.
 
@@ -108,7 +120,8 @@ def play(
         policy: chooses lambda; a pytree, so that policies of one class share a program.
         options: of the steps.
         limit: largest number of linear solves per scene.
-        ftol: relative decrease of an accepted step below which a scene has converged (`converged_in_cost`)."""
+        ftol: relative decrease of an accepted step below which a scene has converged
+            (`converged_in_cost`)."""
     check_x64(bank.initial_cost.dtype)
     played = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
     found: Trajectories = jax.tree.map(np.asarray, played)
@@ -120,7 +133,12 @@ def play(
 
 @functools.partial(jit, static_argnames=("kind", "options", "limit"))
 def _play(
-    kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array
+    kind: SceneClass,
+    bank: Any,
+    policy: DampingPolicy,
+    options: StepOptions,
+    limit: int,
+    ftol: Array,
 ) -> Trajectories:
     """`Trajectories` of JAX arrays; costs without the start."""
     layout = class_layout(kind, options)
@@ -132,7 +150,9 @@ def _play(
         state = LMState(start.cameras, start.points, at(bank.initial_cost))
         return begin(at(bank.info), policy, state)
 
-    def advance(scene: Int[Array, ""], carry: Carry) -> tuple[Carry, tuple[StepInfo, Array], Bool[Array, ""]]:
+    def advance(
+        scene: Int[Array, ""], carry: Carry
+    ) -> tuple[Carry, tuple[StepInfo, Array], Bool[Array, ""]]:
         seen = with_scene(layout, bank.scenes.pixels[scene], bank.scenes.mask[scene])
         carry, step = iterate(seen, carry, policy, Tolerances(), options, limit)
         converged = converged_in_cost(step, ftol)
@@ -149,4 +169,6 @@ def _play(
 
     rows = np.zeros((count, limit), bank.initial_cost.dtype)
     nothing = Trajectories(rows, rows, np.zeros(count, np.int32), np.zeros(count, bool))
-    return refill(count, count, min(LANES, count), fresh, advance, note, jax.tree.map(jnp.asarray, nothing))
+    return refill(
+        count, count, min(LANES, count), fresh, advance, note, jax.tree.map(jnp.asarray, nothing)
+    )

@@ -1,8 +1,9 @@
 """The bank of scenes that the game is played on, and the best known cost of each.
 
-Scenes are made in one compiled program and solved by a portfolio of hand-written rules with embedded point iterations.
-Those that no rule solves, that are solved at the start or that are numerically meaningless are left out. Reaching the
-best known cost ends an episode in training. No observation of a policy depends on it."""
+Scenes are made in one compiled program and solved by a portfolio of hand-written rules with
+embedded point iterations. Those that no rule solves, that are solved at the start or that are
+numerically meaningless are left out. Reaching the best known cost ends an episode in training. No
+observation of a policy depends on it."""
 
 from __future__ import annotations
 
@@ -31,21 +32,27 @@ from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import for_traces
 from jaxba.typing import InputError
 
-PORTFOLIO = ("ceres", "gtsam", "theseus")  # rules whose lowest cost is the best known one, each with point iterations
+# rules whose lowest cost is the best known one, each with point iterations
+PORTFOLIO = ("ceres", "gtsam", "theseus")
 PORTFOLIO_ITERATIONS = 50  # largest number of linear solves of each rule
-PORTFOLIO_FTOL = 1e-7  # relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default
+# relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default
+PORTFOLIO_FTOL = 1e-7
 
 MIN_RATIO, MAX_RATIO = 1.01, 1e6
-"""Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is between 1.04 and 1.1."""
+"""Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is
+between 1.04 and 1.1."""
 
-SMALLEST_COST = 1e-9  # least best cost per observation of a usable scene, pixels squared: below, rounding dominates
+# least best cost per observation of a usable scene, pixels squared: below, rounding dominates
+SMALLEST_COST = 1e-9
 MIN_OBSERVATIONS = 30  # smallest number of observations of a scene that is solved at all
 
 MAX_ERROR_ANGLE = 0.2
-"""Largest RMS error of a solved scene over the focal length; above it points are close to a camera's plane."""
+"""Largest RMS error of a solved scene over the focal length; above it points are close to a
+camera's plane."""
 
 PAPER_ERROR_ANGLE = 1.0  # the same for the family `paper`, whose starts are far away
-EASY_ENOUGH = 40  # iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene
+# iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene
+EASY_ENOUGH = 40
 
 
 class Bank(NamedTuple):
@@ -55,10 +62,13 @@ class Bank(NamedTuple):
     initial_cost: Float[Array, " scenes"]
     best_cost: Float[Array, " scenes"]
     info: ProblemInfo  # a field per scene
-    ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule with the portfolio's steps, to the game's tolerance
+    # of Ceres' rule with the portfolio's steps, to the game's tolerance
+    ceres_iterations: Float[Array, " scenes"]
 
 
-def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
+def info_of(
+    kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int
+) -> ProblemInfo:
     """What a policy knows about each scene before the first iteration."""
 
     def one(scene: Scenes, cost: Array) -> ProblemInfo:
@@ -82,7 +92,9 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     layout = class_layout(kind, StepOptions())
 
     def one(scene: Scenes) -> Array:
-        return cost(with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss())
+        return cost(
+            with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss()
+        )
 
     return jax.lax.map(one, scenes, batch_size=256)
 
@@ -109,13 +121,17 @@ class BankConfig:
     @property
     def options(self) -> StepOptions:
         """Of the portfolio's steps."""
-        return StepOptions(refinement=Refinement(points=self.refine_points), intrinsics=self.intrinsics)
+        return StepOptions(
+            refinement=Refinement(points=self.refine_points), intrinsics=self.intrinsics
+        )
 
     def __post_init__(self) -> None:
         check_count("refine_points", self.refine_points, 0)
         check_count("scenes", self.scenes, 1)
         if bool(self.problems) != (self.kind.family == "windows"):
-            raise ValueError("problems and scenes of the family windows go together: only one of them is given")
+            raise ValueError(
+                "problems and scenes of the family windows go together: only one of them is given"
+            )
         _ = self.options  # raises ValueError if impossible
 
 
@@ -129,18 +145,23 @@ def solve_scenes(
     on_rule: Callable[[str], None] = lambda _: None,
     tolerance: float = 1e-3,
 ) -> tuple[Bank, Bool[np.ndarray, " scenes"]]:
-    """Solves scenes with every rule, and tells which of them are usable. `limit` is that of an episode, for the scenes'
-    `ProblemInfo`; `on_rule` is called with the name of a rule of the portfolio when it begins; `tolerance` is the one
-    to which the first rule's iterations are counted. Raises InputError: none of the scenes is worth solving."""
+    """Solves scenes with every rule, and tells which of them are usable. `limit` is that of an
+    episode, for the scenes' `ProblemInfo`; `on_rule` is called with the name of a rule of the
+    portfolio when it begins; `tolerance` is the one to which the first rule's iterations are
+    counted. Raises InputError: none of the scenes is worth solving."""
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
     keep = worth_solving(kind, info)
     if not len(keep):
-        raise InputError(f"none of {len(info.cost)} scenes of {_shape(kind)} is worth solving: draw more")
+        raise InputError(
+            f"none of {len(info.cost)} scenes of {_shape(kind)} is worth solving: draw more"
+        )
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
-    for rule, (policy, step) in alike({rule: (make_policy(rule), options) for rule in rules}).items():
+    for rule, (policy, step) in alike(
+        {rule: (make_policy(rule), options) for rule in rules}
+    ).items():
         on_rule(rule)
         runs[rule] = play(kind, bank, policy, step, PORTFOLIO_ITERATIONS, PORTFOLIO_FTOL)
     best = np.min([run.costs[:, -1] for run in runs.values()], axis=0)
@@ -174,17 +195,23 @@ def make_split(
     tolerance: float = 1e-3,
     problems: Sequence[StrPath | BundleProblem] = (),
 ) -> Split:
-    """Draws and solves scenes, and splits the usable ones. The same key gives the same scenes. `options` are those of
-    the portfolio's steps, `limit` is that of an episode; `report` is called with a line when something long begins. The
-    game's tolerance does not change which are usable. Windows are cut from `problems`, in memory or files, instead of
-    those that `config` names. Raises InputError: no scene would be left to train on."""
+    """Draws and solves scenes, and splits the usable ones. The same key gives the same scenes.
+    `options` are those of the portfolio's steps, `limit` is that of an episode; `report` is called
+    with a line when something long begins. The game's tolerance does not change which are usable.
+    Windows are cut from `problems`, in memory or files, instead of those that `config` names.
+    Raises InputError: no scene would be left to train on."""
     kind, count, key = config.kind, config.scenes, jax.random.fold_in(key, 0)
     where = _shape(kind)
     on_rule = lambda rule: report(f"{count} scenes of {where}: {rule}")
-    solved = lambda scenes: solve_scenes(kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance)
+    solved = lambda scenes: solve_scenes(
+        kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance
+    )
     if kind.family == "windows":
         seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
-        banks = [select(*solved(scenes)) for scenes in read_windows(problems or config.problems, kind, count, seed)]
+        banks = [
+            select(*solved(scenes))
+            for scenes in read_windows(problems or config.problems, kind, count, seed)
+        ]
     else:
         made, usable = solved(make_scenes(kind, key, count))
         rows = np.flatnonzero(usable)
@@ -197,7 +224,8 @@ def make_split(
 
 
 HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
-"""Fraction of usable scenes held out; more up to a number whose mean says something, at most the last one."""
+"""Fraction of usable scenes held out; more up to a number whose mean says something, at most the
+last one."""
 
 
 def held_out_count(usable: int) -> int:
@@ -206,9 +234,12 @@ def held_out_count(usable: int) -> int:
 
 
 def reach(
-    costs: Float[np.ndarray, "scenes iterations"], best: Float[np.ndarray, " scenes"], tolerance: float
+    costs: Float[np.ndarray, "scenes iterations"],
+    best: Float[np.ndarray, " scenes"],
+    tolerance: float,
 ) -> np.ndarray:
-    """Iterations until the accepted cost is at most `best (1 + tolerance)`; infinite if it never is."""
+    """Iterations until the accepted cost is at most `best (1 + tolerance)`; infinite if it never
+    is."""
     reached = costs <= best[:, None] * (1 + tolerance)
     return np.where(reached.any(axis=1), reached.argmax(axis=1), np.inf)
 

@@ -19,23 +19,33 @@ from jaxba.typing import AnyArray
 def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
     """A layout with an observation slot for every pair of a camera and a point; see `with_scene`.
 
-    Random clusters, if any, are those of a scene where all see all: scenes of a class share them."""
-    return _layout(kind, StepOptions(method=options.method) if options.cluster_cameras else StepOptions())
+    Random clusters, if any, are those of a scene where all see all: scenes of a class share
+    them."""
+    return _layout(
+        kind, StepOptions(method=options.method) if options.cluster_cameras else StepOptions()
+    )
 
 
 @functools.cache
 def _layout(kind: SceneClass, options: StepOptions) -> Layout:
     count = kind.cameras * kind.points
-    camera, point = np.tile(np.arange(kind.cameras), kind.points), np.repeat(np.arange(kind.points), kind.cameras)
+    camera, point = (
+        np.tile(np.arange(kind.cameras), kind.points),
+        np.repeat(np.arange(kind.points), kind.cameras),
+    )
     cameras = np.zeros((kind.cameras, 9))
-    problem = BundleProblem.create(cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point)
+    problem = BundleProblem.create(
+        cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point
+    )
     layout = build_layout(problem, options)
     if layout.grid is None and options.factors_reduced_system:
         raise AssertionError("scenes of the game are dense")
     return layout
 
 
-def with_scene(layout: Layout, pixels: Float[AnyArray, "2 slots"], mask: Bool[AnyArray, " slots"]) -> Layout:
+def with_scene(
+    layout: Layout, pixels: Float[AnyArray, "2 slots"], mask: Bool[AnyArray, " slots"]
+) -> Layout:
     """The layout of the class with one scene's observations."""
     cameras = layout.num_cameras
     seen = jnp.any(mask.reshape(cameras, -1), axis=1)

@@ -1,8 +1,10 @@
-"""Scenes of the game that are cut from real problems: neighbouring cameras with some of the points that they share.
+"""Scenes of the game that are cut from real problems: neighbouring cameras with some of the points
+that they share.
 
-Visibility, noise, wrong matches and starts are those of the problem. Many real problems begin near their end, so half
-of the windows begin where random scenes do: cameras and points are moved by the same random amounts.
-Every camera has a lens of its own, also where the problem shares lenses or keeps them constant."""
+Visibility, noise, wrong matches and starts are those of the problem. Many real problems begin near
+their end, so half of the windows begin where random scenes do: cameras and points are moved by the
+same random amounts. Every camera has a lens of its own, also where the problem shares lenses or
+keeps them constant."""
 
 from __future__ import annotations
 
@@ -14,13 +16,22 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxba.game.random_scenes import MIN_VIEWS, START_CENTER, START_DEPTH, START_ROTATION, SceneClass, Scenes
+from jaxba.game.random_scenes import (
+    MIN_VIEWS,
+    START_CENTER,
+    START_DEPTH,
+    START_ROTATION,
+    SceneClass,
+    Scenes,
+)
 from jaxba.io import read_problem
 from jaxba.io.files import StrPath
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-HELD_OUT = 0.2  # share of a problem's cameras, the last ones in the order of their places, whose windows are held out
+# share of a problem's cameras, the last ones in the order of their places, whose windows are held
+# out
+HELD_OUT = 0.2
 FEWEST_CAMERAS = 4  # cameras of the smallest window
 MOVED = 0.5  # share of the windows that begin where random scenes do
 
@@ -28,9 +39,10 @@ MOVED = 0.5  # share of the windows that begin where random scenes do
 def read_windows(
     problems: Sequence[StrPath | BundleProblem], kind: SceneClass, count: int, seed: int
 ) -> tuple[Scenes, Scenes]:
-    """Windows of problems: those to train on, and held-out ones from other places. Problems are in memory, or files. Of
-    `count` windows, as many of each problem, a fifth is held out; `kind` has their largest numbers of cameras and
-    points, and `seed` is that of the choice. Raises ProblemError: as `read_all`."""
+    """Windows of problems: those to train on, and held-out ones from other places. Problems are in
+    memory, or files. Of `count` windows, as many of each problem, a fifth is held out; `kind` has
+    their largest numbers of cameras and points, and `seed` is that of the choice. Raises
+    ProblemError: as `read_all`."""
     parts: tuple[list, list] = [], []
     for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])
@@ -39,7 +51,8 @@ def read_windows(
         for part, cameras, wanted in zip(parts, places(linked), (share - held, held), strict=True):
             if len(cameras) >= FEWEST_CAMERAS:
                 part.extend(window(problem, kind, linked, cameras, rng) for _ in range(wanted))
-    shuffle = np.random.default_rng([seed, len(problems)]).permutation  # so that the first windows are of all problems
+    # so that the first windows are of all problems
+    shuffle = np.random.default_rng([seed, len(problems)]).permutation
     train, held_out = ([part[k] for k in shuffle(len(part))] for part in parts)
     column = lambda part, name: jnp.asarray(np.stack([getattr(one, name) for one in part]))
     stack = lambda part: Scenes(*(column(part, name) for name in Scenes._fields))
@@ -47,8 +60,9 @@ def read_windows(
 
 
 def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
-    """The problems, in memory or files. Raises ProblemError: a problem cannot be read, has whitened observations, other
-    lenses than BAL's or too few cameras; or none is large enough for windows in two places. One line."""
+    """The problems, in memory or files. Raises ProblemError: a problem cannot be read, has whitened
+    observations, other lenses than BAL's or too few cameras; or none is large enough for windows in
+    two places. One line."""
     problems = []
     for number, path in enumerate(given):
         if isinstance(path, BundleProblem):
@@ -60,19 +74,24 @@ def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
         if problem.lenses is not None and not problem.lenses.all_bal:
             raise ProblemError(f"{path}: windows are made of cameras whose lenses are BAL's")
         if problem.num_cameras < FEWEST_CAMERAS:
-            raise ProblemError(f"{path}: {problem.num_cameras} cameras; a window has {FEWEST_CAMERAS} at least")
+            raise ProblemError(
+                f"{path}: {problem.num_cameras} cameras; a window has {FEWEST_CAMERAS} at least"
+            )
         problems.append(problem)
     least = round(FEWEST_CAMERAS / HELD_OUT)
     if max(problem.num_cameras for problem in problems) < least:
-        raise ProblemError(f"no problem has {least} cameras, so that windows in another place can be held out")
+        raise ProblemError(
+            f"no problem has {least} cameras, so that windows in another place can be held out"
+        )
     return problems
 
 
 def places(
     linked: Int[np.ndarray, "cameras cameras"],
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " held_out"]]:
-    """The cameras of training and of held-out windows. In the order of a band matrix neighbours stand together, so that
-    the last of them are another place. `linked` is as `covisible` returns it."""
+    """The cameras of training and of held-out windows. In the order of a band matrix neighbours
+    stand together, so that the last of them are another place. `linked` is as `covisible` returns
+    it."""
     order = reverse_cuthill_mckee(coo_array(linked).tocsr(), symmetric_mode=True).astype(np.int64)
     first = len(order) - round(HELD_OUT * len(order))
     return order[:first], order[first:]
@@ -95,9 +114,10 @@ def window(
 ) -> Scenes:
     """One window, its arrays without the axis of scenes.
 
-    Cameras join one by one, each time the one that shares most points with those already there; of the points that two
-    of them observe, as many as fit are drawn. `kind` has the largest numbers of cameras and points, `linked` is as
-    `covisible` returns it, and `allowed` are cameras to choose from."""
+    Cameras join one by one, each time the one that shares most points with those already there; of
+    the points that two of them observe, as many as fit are drawn. `kind` has the largest numbers of
+    cameras and points, `linked` is as `covisible` returns it, and `allowed` are cameras to choose
+    from."""
     most = min(kind.cameras, len(allowed))
     size = int(rng.integers(min(FEWEST_CAMERAS, most), most + 1))
     chosen = [int(rng.choice(allowed))]
@@ -118,13 +138,16 @@ def window(
     whole_points = np.pad(start, ((0, rest), (0, 0)))
     whole_grid = np.pad(grid, ((0, more), (0, rest)))
     whole_pixels = np.pad(pixels[:, :, points] * grid, ((0, 0), (0, more), (0, rest)))
-    return Scenes(whole_cameras.T, whole_points.T, whole_pixels.reshape(2, -1), whole_grid.reshape(-1))  # pyright: ignore[reportArgumentType]
+    return Scenes(
+        whole_cameras.T, whole_points.T, whole_pixels.reshape(2, -1), whole_grid.reshape(-1)
+    )  # pyright: ignore[reportArgumentType]
 
 
 def _grid(
     problem: BundleProblem, chosen: Int[np.ndarray, " chosen"]
 ) -> tuple[Bool[np.ndarray, "chosen points"], np.ndarray]:
-    """Which of the chosen cameras see which points, and where; of repeated observations the last."""
+    """Which of the chosen cameras see which points, and where; of repeated observations the
+    last."""
     place = np.full(problem.num_cameras, -1)
     place[chosen] = np.arange(len(chosen))
     row = place[np.asarray(problem.camera_index)]
@@ -137,13 +160,18 @@ def _grid(
     return grid, pixels
 
 
-def _moved(cameras: np.ndarray, points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Cameras turned and shifted, and points moved along their distance, as at the start of random scenes."""
+def _moved(
+    cameras: np.ndarray, points: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cameras turned and shifted, and points moved along their distance, as at the start of random
+    scenes."""
     log_uniform = lambda limits: np.exp(rng.uniform(*np.log(limits)))
     turned, centers = geometry.rotation_matrices(cameras[:, :3]), geometry.camera_centers(cameras)
     step = np.linalg.norm(np.diff(centers, axis=0), axis=1).mean()
     centers = centers + log_uniform(START_CENTER) * step * rng.normal(size=centers.shape)
-    noise = geometry.rotation_matrices(log_uniform(START_ROTATION) * rng.normal(size=(len(cameras), 3)))
+    noise = geometry.rotation_matrices(
+        log_uniform(START_ROTATION) * rng.normal(size=(len(cameras), 3))
+    )
     turned = noise @ turned
     cameras = cameras.copy()
     cameras[:, :3] = geometry.angle_axis(turned)

@@ -29,8 +29,8 @@ OF_AXES = (("sx", "sxy", "s", "sy"), ("sy", "sxy", "s", "sx"), ("sz", "s"))
 """Kinds that say how accurate x, y and z are; the first one that is known counts."""
 
 VERTICAL = 2.0
-"""Standard deviation of heights over the horizontal one where it is not known: of RTK 15 mm against 8, of a phone 1.5
-to 3 times (data sheets of receivers)."""
+"""Standard deviation of heights over the horizontal one where it is not known: of RTK 15 mm against
+8, of a phone 1.5 to 3 times (data sheets of receivers)."""
 
 _MAYBE = re.compile(r"accura|sigma|std|uncertain|precision")
 _ANGLES = re.compile(r"yaw|pitch|roll|omega|phi|kappa|heading|attitude|rotation|angle|deg")
@@ -51,7 +51,8 @@ def kind_of_accuracy(name: str) -> str:
 
 
 def may_be_accuracy(title: str, kind: str) -> bool:
-    """Whether a column seems to have accuracies of places that cannot be used: of no kind, or in degrees."""
+    """Whether a column seems to have accuracies of places that cannot be used: of no kind, or in
+    degrees."""
     text = title.lower()
     return "deg" in text if kind else bool(_MAYBE.search(text)) and not _ANGLES.search(text)
 
@@ -85,7 +86,9 @@ def covariances_of(
             useless.append(column.title)
     for axis, kinds in enumerate(OF_AXES):
         for kind in kinds:
-            table[:, axis] = np.where(np.isnan(table[:, axis]), usable.get(kind, np.nan), table[:, axis])
+            table[:, axis] = np.where(
+                np.isnan(table[:, axis]), usable.get(kind, np.nan), table[:, axis]
+            )
     if useless:
         titles = f"column{'s' * (len(useless) > 1)} {', '.join(useless)}"
         notes.append(f"{file}: the accuracies in {titles} are not used")
@@ -94,7 +97,9 @@ def covariances_of(
     known = np.asarray(np.isfinite(table).any(axis=0))
     if not known[2]:
         table[:, 2] = VERTICAL * table[:, :2].max(axis=1)
-        notes.append(f"{file}: no accuracy of heights: they get {VERTICAL:g} times the horizontal one")
+        notes.append(
+            f"{file}: no accuracy of heights: they get {VERTICAL:g} times the horizontal one"
+        )
     elif not known[:2].any():
         table[:, :2] = table[:, 2:]
         notes.append(f"{file}: no horizontal accuracy: positions get that of heights")
@@ -116,7 +121,10 @@ def without_accuracy(names: Sequence[str], file: str) -> str:
     """The note on images whose accuracy is not known."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     images = f"{len(names)} image{'s' * (len(names) > 1)}"
-    return f"{file}: no accuracy of {images}, which get the largest of the others: {', '.join(names[:3])}{more}"
+    return (
+        f"{file}: no accuracy of {images}, which get the largest of the others: "
+        f"{', '.join(names[:3])}{more}"
+    )
 
 
 def _names_of_columns() -> dict[str, str]:
@@ -125,8 +133,13 @@ def _names_of_columns() -> dict[str, str]:
     for kind, directions in DIRECTIONS.items():
         for accuracy in ACCURACY.split():
             for direction in directions.split():
-                named = [f"{accuracy}{direction}", *([f"{direction}{accuracy}"] if accuracy != "s" else [])]
-                known |= {before + name: kind for name in named for before in ("", "rtk", "gps", "gnss")}
+                named = [
+                    f"{accuracy}{direction}",
+                    *([f"{direction}{accuracy}"] if accuracy != "s" else []),
+                ]
+                known |= {
+                    before + name: kind for name in named for before in ("", "rtk", "gps", "gnss")
+                }
     return known
 
 

@@ -24,20 +24,26 @@ class ControlPoints(NamedTuple):
 
     crs: str  # coordinate system; empty: that of the scene
     names: list[str]  # of points
-    places: Float[np.ndarray, "points 3"]  # east, north, height, or longitude, latitude (degrees), height; or NaN
+    # east, north, height, or longitude, latitude (degrees), height; or NaN
+    places: Float[np.ndarray, "points 3"]
     point: Int[np.ndarray, " pixels"]  # the point at each pixel
     images: list[str]  # the image of each pixel
     pixels: Float[np.ndarray, "pixels 2"]  # from the upper left corner, x to the right, y down
 
 
 def read_control_points(path: StrPath) -> ControlPoints:
-    """Reads a file: the coordinate system, then lines `x y z px py image [name]` between blanks, tabs, semicolons or
-    commas; `#` begins comments. Lines without a name are of one point if their places are the same. What is missing of
-    a place is NaN. Source: docs.opendronemap.org/gcp. Raises ProblemError: it cannot be read, or a line is malformed;
-    one line that names the file and line."""
+    """Reads a file: the coordinate system, then lines `x y z px py image [name]` between blanks,
+    tabs, semicolons or commas; `#` begins comments. Lines without a name are of one point if their
+    places are the same. What is missing of a place is NaN. Source: docs.opendronemap.org/gcp.
+    Raises ProblemError: it cannot be read, or a line is malformed; one line that names the file and
+    line."""
     file = display_name(path)
     lines = enumerate(read_characters(path, otherwise="cp1252").split("\n"), 1)
-    given = [(number, line.strip()) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+    given = [
+        (number, line.strip())
+        for number, line in lines
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if len(given) < 2:
         raise ProblemError(f"{file}: has no points")
     (number, first), *given = given
@@ -53,7 +59,9 @@ def read_control_points(path: StrPath) -> ControlPoints:
             continue  # names of columns
         if len(words) <= len(FIELDS):
             raise ProblemError(f"{where}: has {len(words)} words, not x y z px py image [name]")
-        *place, x, y = (value_of(word, field, where) for word, field in zip(words, FIELDS, strict=False))
+        *place, x, y = (
+            value_of(word, field, where) for word, field in zip(words, FIELDS, strict=False)
+        )
         if not np.isfinite([x, y]).all():
             raise ProblemError(f"{where}: has no pixel")
         name = words[6] if len(words) > 6 and words[6] else " ".join(words[:3])
@@ -70,12 +78,17 @@ def read_control_points(path: StrPath) -> ControlPoints:
     if not images:
         raise ProblemError(f"{file}: has no points")
     crs = "" if first.lower() == LOCAL else system_of(first) or first
-    return ControlPoints(crs, list(names), np.array(places), np.array(point), images, np.array(pixels))
+    return ControlPoints(
+        crs, list(names), np.array(places), np.array(point), images, np.array(pixels)
+    )
 
 
 def _words(line: str) -> list[str]:
-    """The words of a line, of which the sixth is the image; one without a height gets `NO_HEIGHT`."""
-    separator = separator_of(line) if separator_of(line) != "," or len(line.split()) < len(FIELDS) else ""
+    """The words of a line, of which the sixth is the image; one without a height gets
+    `NO_HEIGHT`."""
+    separator = (
+        separator_of(line) if separator_of(line) != "," or len(line.split()) < len(FIELDS) else ""
+    )
     words = cells_of(line, separator)
     if _numbers(words) == len(FIELDS) - 1 < len(words) and is_file(words[len(FIELDS) - 1]):
         words.insert(2, NO_HEIGHT)

@@ -1,4 +1,5 @@
-"""Files in and out: compression, output that replaces a file whole or not at all, and readable errors."""
+"""Files in and out: compression, output that replaces a file whole or not at all, and readable
+errors."""
 
 from __future__ import annotations
 
@@ -22,9 +23,11 @@ from jaxba.runtime.atomic import atomic_write
 StrPath: TypeAlias = str | os.PathLike[str]
 
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
-"""Errors of reading and decompressing a file that are the fault of the file, not of this program."""
+"""Errors of reading and decompressing a file that are the fault of the file, not of this
+program."""
 
-STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")  # open streams; links to files where a shell redirects them
+# open streams; links to files where a shell redirects them
+STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")
 
 _DESCRIPTORS = {"/dev/stdout": 1, "/dev/stderr": 2}
 
@@ -35,7 +38,8 @@ _DECODERS: dict[str, Callable[[], Any]] = {
     ".xz": lzma.LZMADecompressor,
 }
 _PIECE = 1 << 20  # bytes that are read from a file at once
-_BZIP2_BLOCK = 1 << 20  # bytes; bzip2 gives nothing before the end of its first block of at most 900 kB
+# bytes; bzip2 gives nothing before the end of its first block of at most 900 kB
+_BZIP2_BLOCK = 1 << 20
 
 
 def strip_compression(path: StrPath) -> str:
@@ -45,7 +49,8 @@ def strip_compression(path: StrPath) -> str:
 
 
 def sidecar_path(path: StrPath) -> Path:
-    """The file that `jaxba-kitti` writes beside a problem: `kitti00.txt.bz2` has `kitti00.frames.json`."""
+    """The file that `jaxba-kitti` writes beside a problem: `kitti00.txt.bz2` has
+    `kitti00.frames.json`."""
     return Path(strip_compression(path)).with_suffix(".frames.json")
 
 
@@ -64,15 +69,16 @@ def reason(error: BaseException) -> str:
 
 
 def visible(folder: StrPath) -> list[Path]:
-    """What lies in a folder, sorted, without names that begin with a dot: systems leave such files beside any other.
-    Raises OSError: it is no folder, or cannot be listed."""
+    """What lies in a folder, sorted, without names that begin with a dot: systems leave such files
+    beside any other. Raises OSError: it is no folder, or cannot be listed."""
     return sorted(path for path in Path(folder).iterdir() if not path.name.startswith("."))
 
 
 def read_bytes(path: StrPath, decompress: bool = True) -> bytes:
-    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name. Binary
-    files may begin with any number, and are not to be decompressed. Raises ProblemError: it cannot be read, is not
-    compressed as its name says, or is damaged; one line."""
+    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz,
+    whatever its name. Binary files may begin with any number, and are not to be decompressed.
+    Raises ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one
+    line."""
     return b"".join(read_pieces(path, decompress))
 
 
@@ -111,8 +117,9 @@ def beginning(path: StrPath, size: int) -> bytes:
 def open_output(path: StrPath) -> Iterator[BinaryIO]:
     """A stream whose bytes become the file at the end of the block, or not at all (`atomic_write`).
 
-    They are compressed if the name ends in `.bz2`, `.gz` or `.xz`. A device or pipe, such as standard output, is
-    written directly, an open stream from its current position. Raises ProblemError: the file cannot be written."""
+    They are compressed if the name ends in `.bz2`, `.gz` or `.xz`. A device or pipe, such as
+    standard output, is written directly, an open stream from its current position. Raises
+    ProblemError: the file cannot be written."""
     name = display_name(path)
     try:
         target = os.path.realpath(path)
@@ -142,7 +149,8 @@ def _open_stream(path: str) -> BinaryIO:
         return open(path, "wb")
     for stream in (sys.stdout, sys.stderr):  # earlier output must come first
         stream.flush()
-    return os.fdopen(os.dup(number), "wb")  # opening a redirected file by name would start at its beginning
+    # opening a redirected file by name would start at its beginning
+    return os.fdopen(os.dup(number), "wb")
 
 
 def _compression(data: bytes) -> str | None:
@@ -151,7 +159,8 @@ def _compression(data: bytes) -> str | None:
 
 
 def _decompressed(pieces: Iterable[bytes], new_decoder: Callable[[], Any]) -> Iterator[bytes]:
-    """The contents of all streams. The standard library's functions would ignore garbage after the first one."""
+    """The contents of all streams. The standard library's functions would ignore garbage after the
+    first one."""
     decoder = None
     for data in pieces:
         while data := data if decoder else data.lstrip(b"\0"):  # xz allows zeros between streams
@@ -176,4 +185,6 @@ def _compressor(file: IO[bytes], path: StrPath) -> Any:
 
 
 def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
+    )

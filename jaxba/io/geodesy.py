@@ -1,7 +1,8 @@
-"""Positions on the earth in one metric frame: a projected coordinate system, or east, north and up of a place.
+"""Positions on the earth in one metric frame: a projected coordinate system, or east, north and up
+of a place.
 
-Needs pyproj (extra `survey`). Horizontal coordinates are in the order east, north, so longitude stands before latitude.
-"""
+Needs pyproj (extra `survey`). Horizontal coordinates are in the order east, north, so longitude
+stands before latitude."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ GEODETIC, GEOCENTRIC = "EPSG:4979", "EPSG:4978"
 """WGS 84 as longitude, latitude and height, and as metres from the centre of the earth."""
 
 SAME_UNIT = 1e-5
-"""Units are the same if they differ by a smaller share: the feet of files are those of their coordinate system, whose
-two kinds (US survey and international) differ by 2e-6."""
+"""Units are the same if they differ by a smaller share: the feet of files are those of their
+coordinate system, whose two kinds (US survey and international) differ by 2e-6."""
 
 NOT_SAID = (np.nan, np.nan)  # units of a file that does not say in which ones it is
 
@@ -30,7 +31,9 @@ NOT_SAID = (np.nan, np.nan)  # units of a file that does not say in which ones i
 _UTM = re.compile(r"WGS\s*84\s*(?:/|)\s*UTM\s*(?:zone|)\s*(\d{1,2})\s*([NS]?)", re.IGNORECASE)
 _STATED = re.compile(r"#?\s*coordinate\s*system\s*[:=]?\s*(.*)", re.IGNORECASE)
 _SYSTEM = re.compile(
-    r"epsg:\d+(\+(epsg:)?\d+)?|\+(proj|init)=.*|(PROJ|GEOG|COMPD|COMPOUND|BOUND|GEOD)\w*\[.*|.+ / .+", re.I
+    r"epsg:\d+(\+(epsg:)?\d+)?|\+(proj|init)=.*|(PROJ|GEOG|COMPD|COMPOUND|BOUND|GEOD)\w*\[.*|.+ / "
+    r".+",
+    re.I,
 )
 _NAMED = re.compile(r"\w+\[\s*\"([^\"]*)\"")
 
@@ -46,8 +49,8 @@ class Frame:
     """Longitude and latitude, degrees, and height, metres, of WGS 84."""
 
     heights: str | None = field(default=None, compare=False)
-    """Datum of heights that are as their file has them, since the grid of its geoid is not installed; empty: they are
-    what the frame says. None: nothing is in the frame yet."""
+    """Datum of heights that are as their file has them, since the grid of its geoid is not
+    installed; empty: they are what the frame says. None: nothing is in the frame yet."""
 
     def __str__(self) -> str:
         east, north, up = self.origin
@@ -56,8 +59,8 @@ class Frame:
 
 
 def system_of(line: str) -> str:
-    """The coordinate system that a line of a file is, such as `EPSG:32632`, `WGS84 UTM 32N`, a string of PROJ, or WKT,
-    perhaps after `#CoordinateSystem:` as Metashape has it; empty: none."""
+    """The coordinate system that a line of a file is, such as `EPSG:32632`, `WGS84 UTM 32N`, a
+    string of PROJ, or WKT, perhaps after `#CoordinateSystem:` as Metashape has it; empty: none."""
     text = line.strip()
     if (stated := _STATED.fullmatch(text)) is not None:
         text = stated[1].strip()
@@ -67,7 +70,8 @@ def system_of(line: str) -> str:
 
 
 def projected(crs: str) -> Frame:
-    """The frame of a coordinate system. Raises ValueError: it is none, or not one of metres; one line."""
+    """The frame of a coordinate system. Raises ValueError: it is none, or not one of metres; one
+    line."""
     found = _system(crs).to_3d()
     if not found.is_projected or any(axis.unit_name != "metre" for axis in found.axis_info):
         raise ValueError(f"{crs} is no projected coordinate system in metres")
@@ -75,7 +79,8 @@ def projected(crs: str) -> Frame:
 
 
 def is_geographic(crs: str) -> bool:
-    """Whether coordinates are longitudes and latitudes. Raises ValueError: there is no such system; one line."""
+    """Whether coordinates are longitudes and latitudes. Raises ValueError: there is no such system;
+    one line."""
     return _system(crs).is_geographic
 
 
@@ -90,14 +95,16 @@ def in_frame(
 ) -> tuple[Float[np.ndarray, "n 3"], Frame]:
     """Positions of a coordinate system in a frame of metres.
 
-    Heights are above the ellipsoid unless the system says others. Heights of a system in feet are in feet, which a note
-    says. Heights above a geoid whose grid is not installed stay as they are, with a note.
+    Heights are above the ellipsoid unless the system says others. Heights of a system in feet are
+    in feet, which a note says. Heights above a geoid whose grid is not installed stay as they are,
+    with a note.
 
     Args:
         positions: longitude, latitude and height, or easting, northing and height.
         crs: their coordinate system.
         frame: None: east, north and up of a place in the middle.
-        units: metres of the unit of horizontal coordinates, and of that of heights, where the file says them; else NaN.
+        units: metres of the unit of horizontal coordinates, and of that of heights, where the file
+            says them; else NaN.
         origin_of: positions whose median is this middle; None: all.
         where: what notes begin with.
 
@@ -105,7 +112,8 @@ def in_frame(
         The positions, and the frame.
 
     Raises:
-        ValueError: no such system or place, or heights of another kind than those in the frame; one line."""
+        ValueError: no such system or place, or heights of another kind than those in the frame; one
+            line."""
     source = _system(crs)
     called = source.name if "[" in crs else crs
     scales = _scales(source, called, units, where)
@@ -117,10 +125,21 @@ def in_frame(
     if frame.heights not in (None, heights) or (missing and _vertical_datum(target)):
         own = heights or _vertical_datum(source) or "the ellipsoid"
         other = frame.heights or _vertical_datum(target) or "the ellipsoid"
-        grid = f", and the grid {missing} is not installed (pyproj sync --file {missing})" if missing else ""
-        raise ValueError(f"heights of {called} are above {own}, those of the scene above {other}{grid}")
+        grid = (
+            f", and the grid {missing} is not installed (pyproj sync --file {missing})"
+            if missing
+            else ""
+        )
+        raise ValueError(
+            f"heights of {called} are above {own}, those of the scene above {other}{grid}"
+        )
     if missing:
-        report([f"{where}: heights are above {heights} and stay as they are: the grid {missing} is not installed"])
+        report(
+            [
+                f"{where}: heights are above {heights} and stay as they are: the grid {missing} is "
+                "not installed"
+            ]
+        )
         metres = scales * [1.0, 1.0, source.axis_info[2].unit_conversion_factor]
         found, _ = _transformed(positions * metres, source.sub_crs_list[0].to_3d(), target)
     frame = replace(frame, heights=heights)
@@ -128,10 +147,14 @@ def in_frame(
 
 
 def _scales(source: Any, called: str, units: Sequence[float], where: str) -> Float[np.ndarray, "3"]:
-    """What positions are multiplied by to be in the units of their system with heights, where those of a system
-    without heights are metres. Notes in which unit heights are, where the file does not say it and it is no metre."""
+    """What positions are multiplied by to be in the units of their system with heights, where those
+    of a system without heights are metres. Notes in which unit heights are, where the file does not
+    say it and it is no metre."""
     axes = source.axis_info
-    flat, up = (1.0 if source.is_geographic else axes[0].unit_conversion_factor), axes[min(2, len(axes) - 1)]
+    flat, up = (
+        (1.0 if source.is_geographic else axes[0].unit_conversion_factor),
+        axes[min(2, len(axes) - 1)],
+    )
     unit_of_system = up.unit_conversion_factor if len(axes) > 2 or not source.is_geographic else 1.0
     horizontal = units[0] / flat if np.isfinite(units[0]) and not source.is_geographic else 1.0
     if abs(horizontal - 1) < SAME_UNIT:
@@ -146,16 +169,23 @@ def _scales(source: Any, called: str, units: Sequence[float], where: str) -> Flo
 def _middle(positions: Float[np.ndarray, "n 3"], source: Any) -> Frame:
     """East, north and up of the median of positions, which a few wrong ones do not move far."""
     places, _ = _transformed(positions, source.to_3d(), _system(GEODETIC))
-    east = (places[:, 0] - places[0, 0] + 180) % 360 - 180  # so that those about the longitude of 180 have a median
+    # so that those about the longitude of 180 have a median
+    east = (places[:, 0] - places[0, 0] + 180) % 360 - 180
     middle = np.median(np.column_stack([places[0, 0] + east, places[:, 1:]]), axis=0)
     middle[0] -= 360 * np.round(middle[0] / 360)
-    return Frame(origin=(round(float(middle[0]), 7), round(float(middle[1]), 7), round(float(middle[2]), 3)))
+    return Frame(
+        origin=(round(float(middle[0]), 7), round(float(middle[1]), 7), round(float(middle[2]), 3))
+    )
 
 
-def _east_north_up(centred: Float[np.ndarray, "n 3"], origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
+def _east_north_up(
+    centred: Float[np.ndarray, "n 3"], origin: tuple[float, float, float]
+) -> Float[np.ndarray, "n 3"]:
     """Geocentric positions as metres east, north and up of a place."""
     (start,), _ = _transformed(np.array([origin]), _system(GEODETIC), _system(GEOCENTRIC))
-    (sin_east, sin_north), (cos_east, cos_north) = (f(np.radians(origin[:2])) for f in (np.sin, np.cos))
+    (sin_east, sin_north), (cos_east, cos_north) = (
+        f(np.radians(origin[:2])) for f in (np.sin, np.cos)
+    )
     axes = np.array(
         [
             [-sin_east, cos_east, 0.0],
@@ -167,13 +197,15 @@ def _east_north_up(centred: Float[np.ndarray, "n 3"], origin: tuple[float, float
 
 
 def _vertical_datum(system: Any) -> str:
-    """The datum of heights above a geoid or the sea; empty: heights are above the ellipsoid, or there are none."""
+    """The datum of heights above a geoid or the sea; empty: heights are above the ellipsoid, or
+    there are none."""
     parts = system.sub_crs_list
     return parts[1].datum.name if system.is_compound and parts[1].is_vertical else ""
 
 
 def _system(crs: str) -> Any:
-    """A coordinate system. Raises ValueError: there is none of that name, or no pyproj; one line."""
+    """A coordinate system. Raises ValueError: there is none of that name, or no pyproj; one
+    line."""
     try:
         import pyproj
         from pyproj.exceptions import CRSError
@@ -191,8 +223,11 @@ def _system(crs: str) -> Any:
     raise ValueError(f"there is no coordinate system {shown(crs)}")
 
 
-def _transformed(positions: Float[np.ndarray, "n 3"], source: Any, target: Any) -> tuple[Float[np.ndarray, "n 3"], str]:
-    """Positions in another system, and the grid of a geoid that it needs and is not installed; empty: none."""
+def _transformed(
+    positions: Float[np.ndarray, "n 3"], source: Any, target: Any
+) -> tuple[Float[np.ndarray, "n 3"], str]:
+    """Positions in another system, and the grid of a geoid that it needs and is not installed;
+    empty: none."""
     import pyproj
     from pyproj.exceptions import ProjError
 
@@ -215,5 +250,7 @@ def _missing_grid(source: Any, target: Any) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the best one is not available
         others = TransformerGroup(source, target, always_xy=True).unavailable_operations
-    missing = [[grid.short_name for grid in operation.grids if not grid.available] for operation in others]
+    missing = [
+        [grid.short_name for grid in operation.grids if not grid.available] for operation in others
+    ]
     return min(filter(None, missing), key=len, default=["of its geoid"])[0]

@@ -10,12 +10,14 @@ from jaxba.problem.image_names import named_images
 
 
 def files_of_images(folder: StrPath, names: Sequence[str], ending: str = "") -> list[Path | None]:
-    """The file of each image in a folder or the folders below it, by names as `named_images` understands them.
+    """The file of each image in a folder or the folders below it, by names as `named_images`
+    understands them.
 
     Args:
         folder: where files are.
         names: of images.
-        ending: what follows the name of an image, with its own ending or without, in the name of its file.
+        ending: what follows the name of an image, with its own ending or without, in the name of
+            its file.
 
     Returns:
         Files; None: there is none, or it is not clear which one."""

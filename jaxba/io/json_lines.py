@@ -1,6 +1,8 @@
-"""Files of one JSON object per line, as dataclasses of numbers, texts, tuples and further dataclasses.
+"""Files of one JSON object per line, as dataclasses of numbers, texts, tuples and further
+dataclasses.
 
-Numbers that are not finite are written as null, which is read as NaN. A killed run leaves half a line at most."""
+Numbers that are not finite are written as null, which is read as NaN. A killed run leaves half a
+line at most."""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ def key_of(field: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """JSON of dataclasses, named tuples, mappings and tuples; numbers that are not finite become None."""
+    """JSON of dataclasses, named tuples, mappings and tuples; numbers that are not finite become
+    None."""
     if is_dataclass(value):
         return {key_of(field): plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
@@ -45,8 +48,8 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], data: Any, path: str = "") -> T:
-    """The inverse of `plain`; ignores unknown keys. Raises ProblemError: a key without a default is missing, or one is
-    of a wrong type."""
+    """The inverse of `plain`; ignores unknown keys. Raises ProblemError: a key without a default is
+    missing, or one is of a wrong type."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)
@@ -65,7 +68,9 @@ def _value(kind: Any, value: Any, path: str) -> Any:
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list):
             raise ProblemError(f"{path} must be a list")
-        return tuple(_value(typing.get_args(kind)[0], item, f"{path}[{i}]") for i, item in enumerate(value))
+        return tuple(
+            _value(typing.get_args(kind)[0], item, f"{path}[{i}]") for i, item in enumerate(value)
+        )
     if is_dataclass(kind):
         return from_plain(typing.cast(type, kind), value, path)
     if kind is float:
@@ -78,8 +83,9 @@ def _value(kind: Any, value: Any, path: str) -> Any:
 
 
 def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
-    """All lines of a file, in order. Skips empty lines and, with a warning in the log, an incomplete last one. Raises
-    ProblemError: unreadable, or another malformed line; names file and line."""
+    """All lines of a file, in order. Skips empty lines and, with a warning in the log, an
+    incomplete last one. Raises ProblemError: unreadable, or another malformed line; names file and
+    line."""
     try:
         lines, found = Path(path).read_bytes().split(b"\n"), []
     except OSError as error:
@@ -94,15 +100,18 @@ def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
         except (ValueError, RecursionError):  # no JSON or no UTF-8
             if number < len(lines):
                 raise ProblemError(f"{path}, line {number}: this is no JSON") from None
-            _log.warning("%s, line %d: half-written last line of an interrupted run dropped", path, number)
+            _log.warning(
+                "%s, line %d: half-written last line of an interrupted run dropped", path, number
+            )
     return found
 
 
 def append(path: str | os.PathLike[str], value: Any) -> None:
     """Appends a line in a single write, followed by fsync.
 
-    If the file ends in an incomplete line, that line is removed first. If only the newline after a complete line is
-    missing, it is added. Only one process may write at a time. Raises OSError: the file cannot be written."""
+    If the file ends in an incomplete line, that line is removed first. If only the newline after a
+    complete line is missing, it is added. Only one process may write at a time. Raises OSError: the
+    file cannot be written."""
     line = json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode() + b"\n"
     with open(path, "a+b") as file:
         size = file.seek(0, os.SEEK_END)

@@ -1,4 +1,5 @@
-"""JSON files of other programs: every value is checked as it is taken, and every error names record and field."""
+"""JSON files of other programs: every value is checked as it is taken, and every error names record
+and field."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Record:
         return isinstance(self.value, dict) and self.value.get(key) is not None
 
     def get(self, key: str, default: Any = None) -> Record:
-        """The value of a key; where it is not there or null, the default if there is one. Raises ProblemError."""
+        """The value of a key; where it is not there or null, the default if there is one. Raises
+        ProblemError."""
         if default is not None and not self.has(key):
             return Record(default, self.name, self.where)
         if not isinstance(self.value, dict):
@@ -46,7 +48,8 @@ class Record:
         """Sizes of the values of other keys than the known ones, without those that are empty."""
         others = {key: value for key, value in self.value.items() if key not in known and value}
         return {
-            display_name(key): len(value) if isinstance(value, (list, dict)) else 1 for key, value in others.items()
+            display_name(key): len(value) if isinstance(value, (list, dict)) else 1
+            for key, value in others.items()
         }
 
     def rows(self) -> Iterator[Record]:
@@ -93,8 +96,9 @@ class Record:
 
 
 def read_json(path: StrPath) -> Record:
-    """The contents of a JSON file, decompressed; NaN and Infinity, which JSON lacks, are found when they are taken.
-    Raises ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice."""
+    """The contents of a JSON file, decompressed; NaN and Infinity, which JSON lacks, are found when
+    they are taken. Raises ProblemError: the file cannot be read, is no JSON, is nested too deeply,
+    or an object has a key twice."""
     name = display_name(path)
     text = read_characters(path)
     try:

@@ -1,8 +1,10 @@
-"""nerfstudio's `transforms.json`: the cameras of a problem, for radiance fields and Gaussian splats.
+"""nerfstudio's `transforms.json`: the cameras of a problem, for radiance fields and Gaussian
+splats.
 
-A `transform_matrix` is from the camera to the world, and its camera is OpenGL's, as BAL's is: x to the right, y up, -z
-ahead. The world is that of the problem, so there is no `applied_transform`; nerfstudio turns it upright as it loads.
-Source: nerfstudio, `colmap_to_json` with `keep_original_world_coordinate`, and nerfstudio_dataparser.py."""
+A `transform_matrix` is from the camera to the world, and its camera is OpenGL's, as BAL's is: x to
+the right, y up, -z ahead. The world is that of the problem, so there is no `applied_transform`;
+nerfstudio turns it upright as it loads. Source: nerfstudio, `colmap_to_json` with
+`keep_original_world_coordinate`, and nerfstudio_dataparser.py."""
 
 from __future__ import annotations
 
@@ -24,8 +26,12 @@ from jaxba.problem.geometry import camera_poses
 from jaxba.problem.hold import every_lens
 
 KINDS = {
-    **dict.fromkeys(("BAL", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "OPENCV"),
-    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"),
+    **dict.fromkeys(
+        ("BAL", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "OPENCV"
+    ),
+    **dict.fromkeys(
+        ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"
+    ),
     "OPENCV_FISHEYE": "OPENCV_FISHEYE",
 }
 """What nerfstudio calls the camera models that it has."""
@@ -36,13 +42,21 @@ IMAGES = "images"  # folder beside the file in which nerfstudio looks for the im
 def write_transforms(problem: BundleProblem, path: StrPath, like: StrPath | None = None) -> None:
     """Writes the cameras of a problem as nerfstudio's `transforms.json`, without points.
 
-    `like` is the COLMAP model that the problem was read from, whose names and sizes of images, principal points and
-    images without observations the file gets; None: they are made up as by `write_colmap`. Raises ProblemError: as
-    `write_colmap`, or a camera model that nerfstudio does not have."""
+    `like` is the COLMAP model that the problem was read from, whose names and sizes of images,
+    principal points and images without observations the file gets; None: they are made up as by
+    `write_colmap`. Raises ProblemError: as `write_colmap`, or a camera model that nerfstudio does
+    not have."""
     target = display_name(path)
-    model = create_model(problem, target) if like is None else with_problem(read_model(like), problem, target)[0]
+    model = (
+        create_model(problem, target)
+        if like is None
+        else with_problem(read_model(like), problem, target)[0]
+    )
     images = registered(model)[0]
-    lenses = {camera: _lens(model.cameras[camera]) for camera in sorted({image.camera for image in images})}
+    lenses = {
+        camera: _lens(model.cameras[camera])
+        for camera in sorted({image.camera for image in images})
+    }
     alone = len(lenses) == 1  # then it stands before the frames
     kind = _kind((model.cameras[camera].model for camera in lenses), target)
     poses = camera_poses(bal_poses([image.pose for image in images])) * [1.0, -1.0, -1.0, 1.0]
@@ -52,13 +66,18 @@ def write_transforms(problem: BundleProblem, path: StrPath, like: StrPath | None
         | {"transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
         for image, pose in zip(images, poses, strict=True)
     ]
-    document = {"camera_model": kind, **(next(iter(lenses.values())) if alone else {}), "frames": frames}
+    document = {
+        "camera_model": kind,
+        **(next(iter(lenses.values())) if alone else {}),
+        "frames": frames,
+    }
     with open_output(path) as file:
         file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def check_transforms(problem: BundleProblem, path: StrPath) -> None:
-    """Raises ProblemError: nerfstudio does not have a lens of the problem, or not beside the others."""
+    """Raises ProblemError: nerfstudio does not have a lens of the problem, or not beside the
+    others."""
     lenses = every_lens(problem)
     used = np.unique(np.asarray(lenses.index))
     _kind((lenses.model_of(int(one)).name for one in used), display_name(path))
@@ -70,7 +89,10 @@ def _kind(models: Iterable[str], target: str) -> str:
     if lost := [name for name in names if name not in KINDS]:
         raise ProblemError(f"cannot write {target}: nerfstudio has no camera model {lost[0]}")
     if len(kinds := {KINDS[name] for name in names}) > 1:
-        raise ProblemError(f"cannot write {target}: nerfstudio has one camera model in a file, not {', '.join(names)}")
+        raise ProblemError(
+            f"cannot write {target}: nerfstudio has one camera model in a file, not "
+            f"{', '.join(names)}"
+        )
     return kinds.pop()
 
 
@@ -79,4 +101,11 @@ def _lens(camera: Camera) -> dict[str, Any]:
     numbers = dict(zip(CAMERA_MODELS[camera.model].parameters, camera.params, strict=True))
     bent = {name: value for name, value in numbers.items() if name[0] in "kp"}
     size = {"w": camera.width, "h": camera.height, "cx": numbers["cx"], "cy": numbers["cy"]}
-    return {"fl_x": camera.focals[0], "fl_y": camera.focals[-1], **size, "k1": 0.0, "k2": 0.0, **bent}
+    return {
+        "fl_x": camera.focals[0],
+        "fl_y": camera.focals[-1],
+        **size,
+        "k1": 0.0,
+        "k2": 0.0,
+        **bent,
+    }

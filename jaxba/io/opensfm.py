@@ -1,8 +1,10 @@
 """OpenSfM's reconstructions: `reconstruction.json`, and the observations in `tracks.csv` beside it.
 
-Coordinates of images are normalised: the origin is the middle, y grows downwards, the larger side is 1. Focal lengths
-and principal points are in the same unit, so all are multiplied by the larger side. Source: OpenSfM,
-doc/source/dataset.rst and geometry.rst; map/src/tracks_manager.cc for the three versions of tracks."""
+Coordinates of images are normalised: the origin is the middle, y grows downwards, the larger side
+is 1. Focal lengths
+and principal points are in the same unit, so all are multiplied by the larger side. Source:
+OpenSfM, doc/source/dataset.rst and geometry.rst; map/src/tracks_manager.cc for the three versions
+of tracks."""
 
 from __future__ import annotations
 
@@ -22,30 +24,46 @@ from jaxba.problem.geometry import are_rotations
 
 RECONSTRUCTION = "reconstruction.json"  # file by which a folder of OpenSfM is known
 TRACKS = tuple(f"tracks.csv{ending}" for ending in ("", ".gz", ".bz2", ".xz"))
-TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"  # begins the first line of tracks; files of version 0 have no such line
-FIELDS = {0: 8, 1: 9, 2: 11}  # fields of a line of tracks by version: image, track, key-point, x, y, ...
+# begins the first line of tracks; files of version 0 have no such line
+TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
+# fields of a line of tracks by version: image, track, key-point, x, y, ...
+FIELDS = {0: 8, 1: 9, 2: 11}
 
-PARTS = ("cameras", "shots", "points", "rig_cameras", "rig_instances", "biases", "reference_lla", "reference")
+PARTS = (
+    "cameras",
+    "shots",
+    "points",
+    "rig_cameras",
+    "rig_instances",
+    "biases",
+    "reference_lla",
+    "reference",
+)
 """Parts of a reconstruction that are read, or that say nothing without measured positions."""
 
-CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")  # files of control points beside a reconstruction
+# files of control points beside a reconstruction
+CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")
 
 
 def recognises(document: Record) -> bool:
     """Whether a JSON document is a list of reconstructions, or one of them."""
-    first = document.value[0] if isinstance(document.value, list) and document.value else document.value
+    first = (
+        document.value[0] if isinstance(document.value, list) and document.value else document.value
+    )
     return isinstance(first, dict) and "shots" in first and "cameras" in first
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
 def from_document(document: Record, path: StrPath) -> BundleProblem:
-    """The problem of the first reconstruction of a file, which is the largest, and of the tracks beside it.
+    """The problem of the first reconstruction of a file, which is the largest, and of the tracks
+    beside it.
 
-    `perspective`, `simple_radial` and `radial` cameras are optimised; intrinsics of `brown`, `fisheye` and
-    `fisheye_opencv` stay as they are. Images share the lens of their camera. Images and tracks that are not
-    reconstructed are ignored, images that see no point are left out; of repeated observations the last one counts.
-    Raises ProblemError: tracks are missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
-    one line that names the file, the record and the field."""
+    `perspective`, `simple_radial` and `radial` cameras are optimised; intrinsics of `brown`,
+    `fisheye` and `fisheye_opencv` stay as they are. Images share the lens of their camera. Images
+    and tracks that are not reconstructed are ignored, images that see no point are left out; of
+    repeated observations the last one counts. Raises ProblemError: tracks are missing or malformed,
+    a camera model is not one of `MODELS`, or images are of a rig; one line that names the file, the
+    record and the field."""
     if isinstance(document.value, list):
         if not document.value:
             document.fail("holds no reconstruction")
@@ -99,9 +117,15 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
 
 
 def _unused(document: Record, path: StrPath) -> dict[str, int]:
-    """What OpenSfM optimises with and this package does not: measured positions, priors of cameras, control points."""
-    positions = [shot.value.get("gps_position") for _, shot in document.get("shots").entries("shot")]
-    keys = [camera.value if isinstance(camera.value, dict) else () for _, camera in document.get("cameras").entries("")]
+    """What OpenSfM optimises with and this package does not: measured positions, priors of cameras,
+    control points."""
+    positions = [
+        shot.value.get("gps_position") for _, shot in document.get("shots").entries("shot")
+    ]
+    keys = [
+        camera.value if isinstance(camera.value, dict) else ()
+        for _, camera in document.get("cameras").entries("")
+    ]
     beside = [name for name in CONTROL_POINTS if (Path(path).parent / name).is_file()]
     return {
         "measured positions": sum(isinstance(one, list) and any(one) for one in positions),
@@ -114,22 +138,32 @@ def _refuse_rigs(document: Record) -> None:
     if not document.has("rig_instances"):
         return
     for _, instance in document.get("rig_instances").entries("rig instance"):
-        shots = list(instance.get("rig_camera_ids").entries("shot")) if instance.has("rig_camera_ids") else []
+        shots = (
+            list(instance.get("rig_camera_ids").entries("shot"))
+            if instance.has("rig_camera_ids")
+            else []
+        )
         if len(shots) > 1:
-            instance.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
+            instance.fail(
+                "is of a rig of several cameras, whose poses depend on it; rigs are not read"
+            )
 
 
 def _tracks_beside(path: StrPath) -> Path:
     there = [file for name in TRACKS if (file := Path(path).parent / name).is_file()]
     if not there:
-        raise ProblemError(f"{display_name(path)}: there is no {TRACKS[0]} beside it, which has OpenSfM's observations")
+        raise ProblemError(
+            f"{display_name(path)}: there is no {TRACKS[0]} beside it, which has OpenSfM's "
+            "observations"
+        )
     return there[0]
 
 
 def _read_tracks(
     path: StrPath, shots: Container[str], points: Container[str]
 ) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[str, int]]:
-    """The pixels of reconstructed images and points by image and track, and what else the file holds."""
+    """The pixels of reconstructed images and points by image and track, and what else the file
+    holds."""
     name = display_name(path)
     lines = read_characters(path).split("\n")
     version, first = 0, 0
@@ -137,7 +171,9 @@ def _read_tracks(
         stated = lines[0].removeprefix(TRACKS_HEADER).strip()
         version, first = int(stated) if stated in ("1", "2") else -1, 1
         if version < 0:
-            raise ProblemError(f"{name} line 1: version {stated!a} of tracks is not read; 1 and 2 are")
+            raise ProblemError(
+                f"{name} line 1: version {stated!a} of tracks is not read; 1 and 2 are"
+            )
     found: dict[tuple[str, str], tuple[float, float]] = {}
     scales: set[str] = set()
     for at, line in enumerate(lines[first:], first + 1):

@@ -1,7 +1,9 @@
-"""The cameras of OpenSfM: lenses in pixels, and the problem of cameras that look down +z with y downwards.
+"""The cameras of OpenSfM: lenses in pixels, and the problem of cameras that look down +z with y
+downwards.
 
-BAL's camera looks down -z with y upwards, has no principal point, one focal length, and two coefficients of distortion.
-Lenses with more of it become those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE."""
+BAL's camera looks down -z with y upwards, has no principal point, one focal length, and two
+coefficients of distortion. Lenses with more of it become those of `jaxba.CAMERA_MODELS`: Brown's
+FULL_OPENCV, and OPENCV_FISHEYE."""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 from jaxba.problem.intrinsics import Lenses
 
 _RADIAL = {"simple_radial": 1, "radial": 2, "brown": 3, "fisheye_opencv": 4}
-"""Models with two focal lengths and a principal point, and how many radial coefficients they have."""
+"""Models with two focal lengths and a principal point, and how many radial coefficients they
+have."""
 
 MODELS = ("perspective", "fisheye", *_RADIAL)  # camera models that are read
 
@@ -31,7 +34,8 @@ class Lens:
 
     record: Record  # for messages
     size: tuple[float, float]  # of the image, pixels
-    focal: tuple[float, float]  # along x and y, pixels; their ratio stays where the distortion is BAL's
+    # along x and y, pixels; their ratio stays where the distortion is BAL's
+    focal: tuple[float, float]
     center: tuple[float, float]  # principal point from the corner of the image; stays
     distortion: Mapping[str, float]  # by names of the camera models; others are zero
     fisheye: bool  # whether radii are angles
@@ -39,7 +43,9 @@ class Lens:
     @property
     def is_bal(self) -> bool:
         """Whether BAL's k1 and k2 say all of the distortion."""
-        return not self.fisheye and not any(k for name, k in self.distortion.items() if name not in ("k1", "k2"))
+        return not self.fisheye and not any(
+            k for name, k in self.distortion.items() if name not in ("k1", "k2")
+        )
 
     @property
     def model(self) -> str:
@@ -50,17 +56,23 @@ class Lens:
 
 
 def lens(camera: Record) -> Lens:
-    """The lens of a camera. Raises ProblemError: it is of another model, or a number is missing or impossible."""
+    """The lens of a camera. Raises ProblemError: it is of another model, or a number is missing or
+    impossible."""
     model = camera.get("projection_type", "perspective").text()
     if model not in MODELS:
-        camera.fail(f"has projection_type {model!a}, which is not read; read are {', '.join(MODELS)}")
+        camera.fail(
+            f"has projection_type {model!a}, which is not read; read are {', '.join(MODELS)}"
+        )
     width, height = camera.get("width").number(), camera.get("height").number()
     if not min(width, height) > 0:
         camera.fail("has no width and height, so that nothing can be in pixels")
     side = max(width, height)
     optional = lambda key: camera.get(key, 0.0).number()
     count, radial = _RADIAL.get(model, 2), model in _RADIAL
-    fx, fy = (side * camera.get(key).number() for key in (("focal_x", "focal_y") if radial else ("focal", "focal")))
+    fx, fy = (
+        side * camera.get(key).number()
+        for key in (("focal_x", "focal_y") if radial else ("focal", "focal"))
+    )
     if not min(fx, fy) > 0:
         shown = " and ".join(f"{f:g}" for f in dict.fromkeys((fx, fy)))
         camera.fail(f"has focal length {shown}, which must be positive")
@@ -68,7 +80,10 @@ def lens(camera: Record) -> Lens:
     center = width / 2 + cx, height / 2 + cy
     if not np.isfinite([fx, fy, *center]).all():
         camera.fail("has a number that is not finite in pixels")
-    names = [*(f"k{power}" for power in range(1, count + 1)), *(("p1", "p2") if model == "brown" else ())]
+    names = [
+        *(f"k{power}" for power in range(1, count + 1)),
+        *(("p1", "p2") if model == "brown" else ()),
+    ]
     distortion = {name: optional(name) for name in names}
     return Lens(camera, (width, height), (fx, fy), center, distortion, model.startswith("fisheye"))
 
@@ -84,10 +99,12 @@ def assemble(
     camera_index: Int[np.ndarray, " observations"],
     point_index: Int[np.ndarray, " observations"],
 ) -> BundleProblem:
-    """The problem of cameras `P = R X + t`, with pixels from the corner of the image, x to the right, y down.
+    """The problem of cameras `P = R X + t`, with pixels from the corner of the image, x to the
+    right, y down.
 
-    Where the distortion of all lenses is BAL's, so are those of the problem, and covariances stand for a ratio of focal
-    lengths; else all are of the other models. Raises ProblemError: something is not finite."""
+    Where the distortion of all lenses is BAL's, so are those of the problem, and covariances stand
+    for a ratio of focal lengths; else all are of the other models. Raises ProblemError: something
+    is not finite."""
     for one in lenses:
         note_center(path, one.record.where, one.center, one.size)
     bal = all(one.is_bal for one in lenses)
@@ -103,12 +120,16 @@ def assemble(
             intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), parameter in moves
     observations, covariance = pixels, None
     if bal:
-        focal, centers = (np.array([getattr(one, name) for one in lenses]) for name in ("focal", "center"))
+        focal, centers = (
+            np.array([getattr(one, name) for one in lenses]) for name in ("focal", "center")
+        )
         ratio = (focal / focal[:, :1])[lens_of][camera_index]
         observations = (pixels - centers[lens_of][camera_index]) / ratio * COLMAP_FLIP[:2]
         covariance = None if (ratio == 1).all() else np.eye(2) / ratio[:, :, None] ** 2
     unshared = len(lenses) == len(lens_of)
-    model_of = None if bal else np.array([list(dict.fromkeys(names)).index(model) for model in names])
+    model_of = (
+        None if bal else np.array([list(dict.fromkeys(names)).index(model) for model in names])
+    )
     poses = [angle_axis(np.diag(COLMAP_FLIP) @ rotations), translations * COLMAP_FLIP]
     try:
         return BundleProblem.create(
@@ -118,7 +139,9 @@ def assemble(
             camera_index,
             point_index,
             covariance=covariance,
-            lenses=None if bal and unshared and free.all() else Lenses(lens_of, free, model_of, models),
+            lenses=None
+            if bal and unshared and free.all()
+            else Lenses(lens_of, free, model_of, models),
         )
     except ProblemError as error:
         raise ProblemError(f"{display_name(path)}: {error}") from error

@@ -1,4 +1,5 @@
-"""PLY point clouds for viewers such as MeshLab or CloudCompare. Source: Turk 1994, "The PLY Polygon File Format"."""
+"""PLY point clouds for viewers such as MeshLab or CloudCompare. Source: Turk 1994, "The PLY Polygon
+File Format"."""
 
 from __future__ import annotations
 
@@ -15,11 +16,13 @@ _VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3)])
 
 
 def write_ply(problem: BundleProblem, path: StrPath) -> None:
-    """Writes the points (grey), then the camera centres (green), as coloured vertices in scene units.
+    """Writes the points (grey), then the camera centres (green), as coloured vertices in scene
+    units.
 
-    Vertices are binary, little-endian, and hold the float64 numbers exactly. The file is replaced whole or not at all;
-    it is compressed if the name ends in `.bz2`, `.gz` or `.xz`. Arrays are of NumPy or JAX. Raises ProblemError: a
-    point or camera centre is not finite, or the file cannot be written."""
+    Vertices are binary, little-endian, and hold the float64 numbers exactly. The file is replaced
+    whole or not at all; it is compressed if the name ends in `.bz2`, `.gz` or `.xz`. Arrays are of
+    NumPy or JAX. Raises ProblemError: a point or camera centre is not finite, or the file cannot be
+    written."""
     points = np.asarray(problem.points, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         centres = camera_centers(problem.cameras)
@@ -38,6 +41,9 @@ def write_ply(problem: BundleProblem, path: StrPath) -> None:
     ]
     vertices = np.empty(len(points) + len(centres), dtype=_VERTEX)
     vertices["position"] = np.concatenate([points, centres])
-    vertices["colour"][: len(points)], vertices["colour"][len(points) :] = POINT_COLOUR, CAMERA_COLOUR
+    vertices["colour"][: len(points)], vertices["colour"][len(points) :] = (
+        POINT_COLOUR,
+        CAMERA_COLOUR,
+    )
     with open_output(path) as file:
         file.write(("\n".join(header) + "\n").encode() + vertices.tobytes())

@@ -28,20 +28,28 @@ class Measured(NamedTuple):
     loss: Loss
 
 
-def measured_positions(problem: BundleProblem, config: Any, prior_options: Any, priors: Any) -> Measured:
-    """What COLMAP's pose priors and their options say of the images of a config. Raises ValueError: nothing, or one is
-    in degrees."""
+def measured_positions(
+    problem: BundleProblem, config: Any, prior_options: Any, priors: Any
+) -> Measured:
+    """What COLMAP's pose priors and their options say of the images of a config. Raises ValueError:
+    nothing, or one is in degrees."""
     assert problem.labels is not None
     by_image = priors
     if not isinstance(priors, Mapping):
         by_image = {prior.corr_data_id.id: prior for prior in priors}
     known = set(config.images) & set(problem.labels.images.tolist())
-    used = {image: prior for image, prior in by_image.items() if image in known and np.isfinite(prior.position).all()}
+    used = {
+        image: prior
+        for image, prior in by_image.items()
+        if image in known and np.isfinite(prior.position).all()
+    }
     if not used:
         raise ValueError("pose_priors: no image of the config has a position")
     for image, prior in used.items():
         if prior.coordinate_system.name == "WGS84":
-            raise ValueError(f"pose_priors: the position of image {image} is in degrees: convert it to metres")
+            raise ValueError(
+                f"pose_priors: the position of image {image} is in degrees: convert it to metres"
+            )
     fallback = getattr(prior_options, "prior_position_fallback_stddev", 1.0) ** 2 * np.eye(3)
     covariances = []
     for prior in used.values():
@@ -65,14 +73,16 @@ def _prior_loss(options: Any) -> Loss:
 
 
 def alignment_to(problem: BundleProblem, measured: Measured) -> Similarity:
-    """The similarity that moves a problem to measured positions. Raises ProblemError: as `alignment`."""
+    """The similarity that moves a problem to measured positions. Raises ProblemError: as
+    `alignment`."""
     centers = camera_centers(problem.cameras)[measured.images]
     similarity, _ = alignment(centers, measured.positions, measured.covariances)
     return similarity
 
 
 def with_positions(problem: BundleProblem, measured: Measured) -> BundleProblem:
-    """A problem in the frame of measured positions, with them as priors. Raises: as `with_position_priors`."""
+    """A problem in the frame of measured positions, with them as priors. Raises: as
+    `with_position_priors`."""
     return with_position_priors(
         problem,
         measured.positions,

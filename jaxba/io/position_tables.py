@@ -1,4 +1,5 @@
-"""Measured positions of images in tables: flight logs, exports of other programs, OpenDroneMap's `geo.txt`."""
+"""Measured positions of images in tables: flight logs, exports of other programs, OpenDroneMap's
+`geo.txt`."""
 
 from __future__ import annotations
 
@@ -12,20 +13,34 @@ from jaxba.io.accuracies import KINDS, Accuracies, covariances_of, kind_of_accur
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.geodesy import NOT_SAID, system_of
-from jaxba.io.tables import LEAST_POSITIONS, cells_of, file_joined, is_value, plain, separator_of, title_of, value_of
+from jaxba.io.tables import (
+    LEAST_POSITIONS,
+    cells_of,
+    file_joined,
+    is_value,
+    plain,
+    separator_of,
+    title_of,
+    value_of,
+)
 from jaxba.problem.bundle_problem import ProblemError
 
 WGS84 = "EPSG:4326"  # what longitudes and latitudes are of, if nothing else is said
 
 WORDS = {
-    "name": "image images imagename imagefile imagefilename imagepath photo photos photoname photofile file filename "
+    "name": "image images imagename imagefile imagefilename imagepath photo photos photoname "
+    "photofile file filename "
     "filepath label name sourcefile cameralabel cameraname bild bildname foto",
-    "x": "x easting east e xeasting eastingx geox coordx xcoord xcoordinate utmx utmeasting rechtswert",
-    "y": "y northing north n ynorthing northingy geoy coordy ycoord ycoordinate utmy utmnorthing hochwert",
+    "x": "x easting east e xeasting eastingx geox coordx xcoord xcoordinate utmx utmeasting "
+    "rechtswert",
+    "y": "y northing north n ynorthing northingy geoy coordy ycoord ycoordinate utmy utmnorthing "
+    "hochwert",
     "longitude": "longitude lon lng long gpslongitude xlongitude longitudex geolon",
     "latitude": "latitude lat gpslatitude ylatitude latitudey geolat",
-    "height": "z height altitude alt elevation elev up gpsaltitude zaltitude zheight zelevation altitudez geoz coordz "
-    "zcoord zcoordinate ellipsoidalheight ellipsoidheight heightellipsoidal altitudeellipsoidal absolutealtitude "
+    "height": "z height altitude alt elevation elev up gpsaltitude zaltitude zheight zelevation "
+    "altitudez geoz coordz "
+    "zcoord zcoordinate ellipsoidalheight ellipsoidheight heightellipsoidal altitudeellipsoidal "
+    "absolutealtitude "
     "höhe",
     "sxy": "horizontal gpshpositioningerror",
     "sz": "vertical",
@@ -41,20 +56,25 @@ WITHOUT_NAMES = {
     7: ("x", "y", "height", "yaw", "pitch", "roll", "sxy"),
     8: ("x", "y", "height", "yaw", "pitch", "roll", "sxy", "sz"),
 }
-"""What follows a name in lines without names of columns, by the number of columns. Source: OpenDroneMap's `geo.txt`
-(docs.opendronemap.org/geo); three angles or three numbers more are also what Pix4D writes."""
+"""What follows a name in lines without names of columns, by the number of columns. Source:
+OpenDroneMap's `geo.txt` (docs.opendronemap.org/geo); three angles or three numbers more are also
+what Pix4D writes."""
 
-LARGEST_SHARE = 0.01  # extent of positions in degrees, over their distance from 0, 0: metres of a scene are not so far
+# extent of positions in degrees, over their distance from 0, 0: metres of a scene are not so far
+LARGEST_SHARE = 0.01
 
 
 class Positions(NamedTuple):
     """Positions of images."""
 
     names: list[str]
-    places: Float[np.ndarray, "n 3"]  # x, y, z, or longitude and latitude (degrees) and height; NaN: there is none
-    covariances: Float[np.ndarray, "n 3 3"] | None  # along x, y and z, or metres east, north and up; None: not known
+    # x, y, z, or longitude and latitude (degrees) and height; NaN: there is none
+    places: Float[np.ndarray, "n 3"]
+    # along x, y and z, or metres east, north and up; None: not known
+    covariances: Float[np.ndarray, "n 3 3"] | None
     crs: str  # coordinate system; empty: that of the scene
-    units: tuple[float, float] = NOT_SAID  # metres of the units of x and y, and of z, if the file says them
+    # metres of the units of x and y, and of z, if the file says them
+    units: tuple[float, float] = NOT_SAID
     notes: tuple[str, ...] = ()  # on covariances
     degrees: bool = False  # whether columns are called longitude and latitude
 
@@ -78,18 +98,20 @@ class Layout(NamedTuple):
 
 
 def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Positions:
-    """Reads a table with a line of names (`WORDS`), between commas, semicolons, tabs or blanks, or as OpenDroneMap and
-    Pix4D write it, without one (`WITHOUT_NAMES`).
+    """Reads a table with a line of names (`WORDS`), between commas, semicolons, tabs or blanks, or
+    as OpenDroneMap and Pix4D write it, without one (`WITHOUT_NAMES`).
 
     Args:
         path: the file.
-        crs_is_geographic: whether positions are longitudes and latitudes, if something else says it.
+        crs_is_geographic: whether positions are longitudes and latitudes, if something else says
+            it.
 
     Returns:
         Positions, NaN where there is none.
 
     Raises:
-        ProblemError: it cannot be read, or a column is missing; one line that names the file and line."""
+        ProblemError: it cannot be read, or a column is missing; one line that names the file and
+            line."""
     file = display_name(path)
     lines = read_characters(path, otherwise="cp1252").split("\n")  # that of spreadsheets on Windows
     layout = _with_names(lines) or _without_names(lines, file, crs_is_geographic)
@@ -124,7 +146,9 @@ def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Position
     there = np.asarray(np.isfinite(np.array(places)).all(axis=1))
     covariances, notes = covariances_of(accuracies, layout.unused, names, there, file)
     crs = layout.crs or (WGS84 if degrees else "")
-    return Positions(names, np.array(places), covariances, crs, (units[0], units[2]), notes, degrees)
+    return Positions(
+        names, np.array(places), covariances, crs, (units[0], units[2]), notes, degrees
+    )
 
 
 def _with_names(lines: Sequence[str]) -> Layout | None:
@@ -140,7 +164,8 @@ def _with_names(lines: Sequence[str]) -> Layout | None:
 
 
 def _named(titles: Sequence[str]) -> tuple[dict[str, Column], tuple[str, ...]]:
-    """The column of each thing that a line of names has, and titles of those that may be accuracies."""
+    """The column of each thing that a line of names has, and titles of those that may be
+    accuracies."""
     known = {word: what for what, words in WORDS.items() for word in words.split()}
     columns: dict[str, Column] = {}
     unused = []
@@ -156,8 +181,11 @@ def _named(titles: Sequence[str]) -> tuple[dict[str, Column], tuple[str, ...]]:
 
 
 def _without_names(lines: Sequence[str], file: str, crs_is_geographic: bool | None) -> Layout:
-    """The layout of a file without names of columns: perhaps a coordinate system, then a name and numbers a line."""
-    filled = [at for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
+    """The layout of a file without names of columns: perhaps a coordinate system, then a name and
+    numbers a line."""
+    filled = [
+        at for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")
+    ]
     unclear = f"{file}: no line names the columns, such as image, latitude, longitude, altitude"
     if not filled:
         raise ProblemError(unclear)
@@ -172,13 +200,17 @@ def _without_names(lines: Sequence[str], file: str, crs_is_geographic: bool | No
     else:
         raise ProblemError(unclear)
     names = WITHOUT_NAMES[min(count, max(WITHOUT_NAMES))]
-    if not crs and _looks_like_degrees([row[:2] for row in values if len(row) > 1], crs_is_geographic, unclear):
+    if not crs and _looks_like_degrees(
+        [row[:2] for row in values if len(row) > 1], crs_is_geographic, unclear
+    ):
         names = ("latitude", "longitude", *names[2:])  # as Pix4D has it
     columns = {name: Column(at, name) for at, name in enumerate(("name", *names))}
     return layout._replace(columns=columns)
 
 
-def _looks_like_degrees(values: Sequence[Sequence[float]], crs_is_geographic: bool | None, unclear: str) -> bool:
+def _looks_like_degrees(
+    values: Sequence[Sequence[float]], crs_is_geographic: bool | None, unclear: str
+) -> bool:
     """Whether pairs of numbers are degrees. Raises ProblemError: they may be, and may be metres."""
     if crs_is_geographic is not None:
         return crs_is_geographic

@@ -1,4 +1,5 @@
-"""Measured positions of images: tables of flight logs, COLMAP's database, nerfstudio's file, the GPS of photos."""
+"""Measured positions of images: tables of flight logs, COLMAP's database, nerfstudio's file, the
+GPS of photos."""
 
 from __future__ import annotations
 
@@ -22,24 +23,36 @@ from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
 
 GPS, ABOVE_SEA, ACCURACY = 0x8825, 5, 31
-"""Block of the EXIF data of a photo with its position, and its fields: 1 below sea level, and GPSHPositioningError, the
-horizontal accuracy in metres. Source: CIPA DC-008 (EXIF 2.32), section 4.6.6."""
+"""Block of the EXIF data of a photo with its position, and its fields: 1 below sea level, and
+GPSHPositioningError, the horizontal accuracy in metres. Source: CIPA DC-008 (EXIF 2.32), section
+4.6.6."""
 
 
 def read_file(path: StrPath, crs_is_geographic: bool | None = None) -> Positions:
     """Positions of nerfstudio's file, or of a table; the rest is as for `read_table`."""
-    return read_transforms(path) if Path(path).suffix == ".json" else read_table(path, crs_is_geographic)
+    return (
+        read_transforms(path)
+        if Path(path).suffix == ".json"
+        else read_table(path, crs_is_geographic)
+    )
 
 
 def read_database(path: StrPath) -> Positions:
-    """Reads the positions of COLMAP's database. Source: COLMAP 4.2, `pose_priors` in database_sqlite.cc; before 4.0 the
-    table has the image instead of sensor and data. Raises ProblemError: it is none, or has no positions; one line."""
-    file, rows = display_name(path), _pose_priors(path, "position", "position_covariance", "coordinate_system")
+    """Reads the positions of COLMAP's database. Source: COLMAP 4.2, `pose_priors` in
+    database_sqlite.cc; before 4.0 the table has the image instead of sensor and data. Raises
+    ProblemError: it is none, or has no positions; one line."""
+    file, rows = (
+        display_name(path),
+        _pose_priors(path, "position", "position_covariance", "coordinate_system"),
+    )
     places = np.array([_numbers(row[1], 3) for row in rows]).reshape(-1, 3)
     kept = np.flatnonzero(np.isfinite(places).all(axis=1))
     systems = {rows[at][3] for at in kept}
     if len(systems) != 1:
-        raise ProblemError(f"{file}: has {'positions of different coordinate systems' if systems else 'no positions'}")
+        raise ProblemError(
+            f"{file}: has "
+            f"{'positions of different coordinate systems' if systems else 'no positions'}"
+        )
     covariances = np.array([_numbers(rows[at][2], 9) for at in kept]).reshape(-1, 3, 3)
     names = [rows[at][0] for at in kept]
     geographic = systems == {0}
@@ -52,12 +65,15 @@ def read_database(path: StrPath) -> Positions:
         covariances[~known] = covariances[largest]
         notes = (without_accuracy([names[at] for at in np.flatnonzero(~known)], file),)
     crs = WGS84 if geographic else ""
-    return Positions(names, places, covariances if known.any() else None, crs, notes=notes, degrees=geographic)
+    return Positions(
+        names, places, covariances if known.any() else None, crs, notes=notes, degrees=geographic
+    )
 
 
 def read_gravity(path: StrPath) -> dict[str, Float[np.ndarray, "3"]]:
-    """Reads where up is in images of COLMAP's database, by name, in COLMAP's axes of the camera: the opposite of its
-    gravity, which points down. Source: COLMAP 4.2, `SynthesizeDataset`. Raises ProblemError: as `read_database`."""
+    """Reads where up is in images of COLMAP's database, by name, in COLMAP's axes of the camera:
+    the opposite of its gravity, which points down. Source: COLMAP 4.2, `SynthesizeDataset`. Raises
+    ProblemError: as `read_database`."""
     priors = [(name, -_numbers(blob, 3)) for name, blob in _pose_priors(path, "gravity")]
     if not (found := {name: up for name, up in priors if np.isfinite(up).all()}):
         raise ProblemError(f"{display_name(path)}: has no directions of gravity")
@@ -65,19 +81,28 @@ def read_gravity(path: StrPath) -> dict[str, Float[np.ndarray, "3"]]:
 
 
 def _pose_priors(path: StrPath, *wanted: str) -> list[Any]:
-    """Names of images with columns of their priors, which are None where the table does not have them."""
+    """Names of images with columns of their priors, which are None where the table does not have
+    them."""
     try:
         with closing(sqlite3.connect(f"{Path(path).resolve().as_uri()}?mode=ro", uri=True)) as base:
-            base.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")  # as names in a model
+            # as names in a model
+            base.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")
             columns = [row[1] for row in base.execute("PRAGMA table_info(pose_priors)")]
-            image, own = ("image_id", "") if "image_id" in columns else ("corr_data_id", "AND corr_sensor_type = 0")
+            image, own = (
+                ("image_id", "")
+                if "image_id" in columns
+                else ("corr_data_id", "AND corr_sensor_type = 0")
+            )
             names = ", ".join(one if one in columns else "NULL" for one in wanted)
             return base.execute(
                 f"SELECT name, {names} FROM pose_priors JOIN images "
                 f"ON images.image_id = pose_priors.{image} {own} ORDER BY images.image_id"
             ).fetchall()
-    except (sqlite3.Error, UnicodeError) as error:  # UnicodeError: of a damaged schema, in SQLite's own message
-        raise ProblemError(f"{display_name(path)}: is no database of COLMAP with positions: {reason(error)}") from None
+    # UnicodeError: of a damaged schema, in SQLite's own message
+    except (sqlite3.Error, UnicodeError) as error:
+        raise ProblemError(
+            f"{display_name(path)}: is no database of COLMAP with positions: {reason(error)}"
+        ) from None
 
 
 def _numbers(blob: bytes | None, count: int) -> Float[np.ndarray, " count"]:
@@ -85,8 +110,9 @@ def _numbers(blob: bytes | None, count: int) -> Float[np.ndarray, " count"]:
 
 
 def read_transforms(path: StrPath) -> Positions:
-    """Reads the positions of nerfstudio's frames, as phones measure them, in the world before `applied_transform` and
-    `applied_scale`. Raises ProblemError: it cannot be read, or has no frames; one line that names the field."""
+    """Reads the positions of nerfstudio's frames, as phones measure them, in the world before
+    `applied_transform` and `applied_scale`. Raises ProblemError: it cannot be read, or has no
+    frames; one line that names the field."""
     document = read_json(path)
     frames = list(document.get("frames").rows())
     if not frames:
@@ -98,7 +124,9 @@ def read_transforms(path: StrPath) -> Positions:
         applied.fail("has a rotation that is none")
     places = (places / document.get("applied_scale", 1.0).number() - turn[:, 3]) @ turn[:, :3]
     files = [PurePosixPath(frame.get("file_path").text()).parts for frame in frames]
-    return Positions(["/".join(file[file[0] == IMAGES :] if file else ()) for file in files], places, None, "")
+    return Positions(
+        ["/".join(file[file[0] == IMAGES :] if file else ()) for file in files], places, None, ""
+    )
 
 
 def _matrix(record: Record) -> Float[np.ndarray, "3 4"]:
@@ -109,8 +137,9 @@ def _matrix(record: Record) -> Float[np.ndarray, "3 4"]:
 
 
 def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:
-    """Reads the GPS position of each photo of a folder that has one, by the names of images, which photos may have in
-    another case or with another ending. Raises ProblemError: none has; one line."""
+    """Reads the GPS position of each photo of a folder that has one, by the names of images, which
+    photos may have in another case or with another ending. Raises ProblemError: none has; one
+    line."""
     found, places, accuracies = [], [], []
     names = list(names)
     for name, file in zip(names, files_of_images(folder, names), strict=True):
@@ -120,23 +149,31 @@ def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:
             places.append(place[:3])
             accuracies.append(str(place[3]))
     if not found:
-        raise ProblemError(f"{display_name(folder)}: no photo of the model there has a GPS position")
+        raise ProblemError(
+            f"{display_name(folder)}: no photo of the model there has a GPS position"
+        )
     column = Accuracies("sxy", "GPSHPositioningError", np.nan, accuracies)
     known = [column] if set(accuracies) != {"nan"} else []
-    covariances, notes = covariances_of(known, (), found, np.ones(len(found), bool), display_name(folder))
+    covariances, notes = covariances_of(
+        known, (), found, np.ones(len(found), bool), display_name(folder)
+    )
     return Positions(found, np.array(places), covariances, WGS84, notes=notes, degrees=True)
 
 
 def _place_of(photo: Path) -> list[float] | None:
-    """Longitude, latitude, height and horizontal accuracy (NaN: not known) of a photo; None: it is not there, is no
-    photo, or has no place."""
+    """Longitude, latitude, height and horizontal accuracy (NaN: not known) of a photo; None: it is
+    not there, is no photo, or has no place."""
     from PIL import Image
 
     try:
         with Image.open(photo) as image:
             gps = image.getexif().get_ifd(GPS)
         below = gps.get(ABOVE_SEA, 0) in (1, b"\x01")
-        place = [_degrees(gps[4], gps[3]), _degrees(gps[2], gps[1]), float(gps[6]) * (-1.0 if below else 1.0)]
+        place = [
+            _degrees(gps[4], gps[3]),
+            _degrees(gps[2], gps[1]),
+            float(gps[6]) * (-1.0 if below else 1.0),
+        ]
         accuracy = float(gps.get(ACCURACY, np.nan))
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, SyntaxError):
         return None

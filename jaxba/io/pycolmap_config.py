@@ -25,13 +25,14 @@ GAUGES: dict[str, Gauge] = {"TWO_CAMS_FROM_WORLD": "two-cameras", "THREE_POINTS"
 
 
 def chosen_part(reconstruction: Any, config: Any, options: Any) -> BundleProblem:
-    """The problem of what a config means of a reconstruction: what its images see, and what others see of its points.
-    Those others are constant, and points that are seen by more images, unless they are the config's. A ProblemWarning
-    says what was left out.
+    """The problem of what a config means of a reconstruction: what its images see, and what others
+    see of its points. Those others are constant, and points that are seen by more images, unless
+    they are the config's. A ProblemWarning says what was left out.
 
     Args:
         reconstruction: a `pycolmap.Reconstruction`.
-        config: a `pycolmap.BundleAdjustmentConfig`; None: all images and points, all of it optimised.
+        config: a `pycolmap.BundleAdjustmentConfig`; None: all images and points, all of it
+            optimised.
         options: a `pycolmap.BundleAdjustmentOptions`.
 
     Raises: as `jaxba.from_pycolmap`."""
@@ -60,7 +61,8 @@ def _assembled(model: Model, options: Any) -> Assembled:
 
 
 def _chosen(reconstruction: Any, config: Any) -> tuple[list[int], list[int]]:
-    """Ids of images and points of a config. Raises ValueError: the reconstruction has no such one."""
+    """Ids of images and points of a config. Raises ValueError: the reconstruction has no such
+    one."""
     if not hasattr(config, "fixed_gauge"):
         raise ValueError(f"config must be a pycolmap.BundleAdjustmentConfig, not {shown(config)}")
     images = sorted(config.images)
@@ -69,13 +71,15 @@ def _chosen(reconstruction: Any, config: Any) -> tuple[list[int], list[int]]:
         exists = getattr(reconstruction, f"exists_{kind}")
         lost = [item for item in items if not exists(item)]
         if lost:
-            raise ValueError(f"config names {kind} {lost[0]}, which the reconstruction does not have")
+            raise ValueError(
+                f"config names {kind} {lost[0]}, which the reconstruction does not have"
+            )
     return images, points
 
 
 def without_views_behind(problem: BundleProblem) -> BundleProblem:
-    """The problem without views of points behind their image, itself if there are none. Raises NothingObserved: no
-    other view is there."""
+    """The problem without views of points behind their image, itself if there are none. Raises
+    NothingObserved: no other view is there."""
     behind = views_behind(problem)
     if not behind.any():
         return problem
@@ -85,9 +89,11 @@ def without_views_behind(problem: BundleProblem) -> BundleProblem:
     return problem.subset(~behind)
 
 
-def constrained(problem: BundleProblem, reconstruction: Any, config: Any, options: Any) -> BundleProblem:
-    """The problem of `chosen_part` with what config and options hold, and in the gauge of the config. Arguments as
-    there. Raises: as `from_pycolmap`."""
+def constrained(
+    problem: BundleProblem, reconstruction: Any, config: Any, options: Any
+) -> BundleProblem:
+    """The problem of `chosen_part` with what config and options hold, and in the gauge of the
+    config. Arguments as there. Raises: as `from_pycolmap`."""
     labels = problem.labels
     assert labels is not None
     problem = _held(problem, options)
@@ -99,7 +105,9 @@ def constrained(problem: BundleProblem, reconstruction: Any, config: Any, option
     if problem.rigs is not None and problem.rigs.free is not None:
         images = images[~np.asarray(problem.rigs.free)[images]]  # those say where their frame is
     lenses = {*config.constant_cam_intrinsics} & set(labels.lenses.tolist())
-    sensors = {sensor.id for sensor in config.constant_sensor_from_rig_poses} & set(labels.lenses.tolist())
+    sensors = {sensor.id for sensor in config.constant_sensor_from_rig_poses} & set(
+        labels.lenses.tolist()
+    )
     points = {*config.constant_points} & set(labels.points.tolist())
     problem = hold(
         problem,
@@ -127,7 +135,8 @@ def _held(problem: BundleProblem, options: Any) -> BundleProblem:
 
 
 def everything(reconstruction: Any) -> Any:
-    """The config of all registered images, in the gauge of two cameras, as `pycolmap.bundle_adjustment` has it."""
+    """The config of all registered images, in the gauge of two cameras, as
+    `pycolmap.bundle_adjustment` has it."""
     pycolmap = importlib.import_module("pycolmap")
     config = pycolmap.BundleAdjustmentConfig()
     for image in reconstruction.reg_image_ids():
@@ -137,7 +146,8 @@ def everything(reconstruction: Any) -> Any:
 
 
 def gauged(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
-    """The problem in a gauge; without one where it has too few points for that, as COLMAP goes on."""
+    """The problem in a gauge; without one where it has too few points for that, as COLMAP goes
+    on."""
     try:
         return fixed_gauge(problem, gauge)
     except ProblemError:

@@ -1,6 +1,7 @@
 """What `pycolmap.BundleAdjustmentOptions` say, for pycolmap 3.12 to 4.2.
 
-COLMAP 4 keeps what is Ceres' in a group `ceres`; COLMAP 3 has it beside the others, and lacks the newer options."""
+COLMAP 4 keeps what is Ceres' in a group `ceres`; COLMAP 3 has it beside the others, and lacks the
+newer options."""
 
 from __future__ import annotations
 
@@ -27,15 +28,17 @@ HOW = re.compile(
     r"|solver_options\.(?!min_trust_region_radius|max_num_consecutive_invalid_steps).*"
     r"|caspar\.(gpu_index|pcg_.*|diag_(init|min|scaling_.*))"
 )
-"""Names of options that say how and where COLMAP computes, but neither what is optimised nor when it stops."""
+"""Names of options that say how and where COLMAP computes, but neither what is optimised nor when
+it stops."""
 
 
 def options_of(options: Any) -> Any:
-    """Options as pycolmap's object. Raises ValueError: they are something else, or have other names; one line.
+    """Options as pycolmap's object. Raises ValueError: they are something else, or have other
+    names; one line.
 
     Args:
-        options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values by name, in which groups are
-            dictionaries; None: COLMAP's defaults."""
+        options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values by name, in
+            which groups are dictionaries; None: COLMAP's defaults."""
     if options is None or isinstance(options, Mapping):
         return _made(options or {})
     if not hasattr(options, "refine_focal_length"):
@@ -77,7 +80,8 @@ def ceres_options(options: Any) -> Any:
 
 
 def ignored(options: Any) -> list[str]:
-    """Names of options that differ from COLMAP's defaults, change where COLMAP ends, and mean nothing here."""
+    """Names of options that differ from COLMAP's defaults, change where COLMAP ends, and mean
+    nothing here."""
     given = named_values(options.todict())
     usual = named_values(type(options)().todict())
     changed = [name for name in given if str(given[name]) != str(usual.get(name))]

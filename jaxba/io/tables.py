@@ -1,4 +1,5 @@
-"""Tables as spreadsheets and other programs write them: separators, decimal commas, units, cells without a value."""
+"""Tables as spreadsheets and other programs write them: separators, decimal commas, units, cells
+without a value."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from jaxtyping import Bool, Float
 
 from jaxba.io.text import finite_numbers
 
-SEPARATORS = "\t;,"  # what separates cells, in the order in which they are tried; if none does, blanks do
+# what separates cells, in the order in which they are tried; if none does, blanks do
+SEPARATORS = "\t;,"
 
 NO_VALUE = frozenset(("", "-", "--", "?", "nan", "n/a", "na", "#n/a", "#nv", "none", "null", "nil"))
 """Cells that say that there is no value, in small letters."""
@@ -18,7 +20,8 @@ NO_VALUE = frozenset(("", "-", "--", "?", "nan", "n/a", "na", "#n/a", "#nv", "no
 NO_NUMBER = (-999.0, -9999.0, -99999.0, -32767.0, -32768.0)
 """Numbers that stand for no value: no place on the earth is so low."""
 
-FAR = 20.0  # distance of a map's origin from positions, over their extent, from which it is none of them
+# distance of a map's origin from positions, over their extent, from which it is none of them
+FAR = 20.0
 
 LEAST_POSITIONS = 3  # without which they have no extent
 
@@ -26,15 +29,20 @@ UNITS = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
     **{"km": 1e3, "cm": 1e-2, "mm": 1e-3},
     **dict.fromkeys(("ft", "foot", "feet", "ift", "intlft", "internationalfeet"), 0.3048),
-    **dict.fromkeys(("usft", "ftus", "usfeet", "sft", "ussurveyfeet", "ussurveyfoot", "ussurveyft"), 1200 / 3937),
+    **dict.fromkeys(
+        ("usft", "ftus", "usfeet", "sft", "ussurveyfeet", "ussurveyfoot", "ussurveyft"), 1200 / 3937
+    ),
     **dict.fromkeys(("deg", "degree", "degrees", "decimaldegree", "decimaldegrees", "dd"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), 180 / np.pi),
 }
-"""Metres or degrees of a unit, by its letters. Feet are international, or those of US surveys until 2022 (NIST)."""
+"""Metres or degrees of a unit, by its letters. Feet are international, or those of US surveys until
+2022 (NIST)."""
 
 _FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,3}$")
 _NUMBER = re.compile(r"[-+]?[.,]?\d([\d.,]*\d)?\.?([eE][-+]?\d+)?")
-_ANGLE = re.compile(r"([\d.]+)\s*(?:°|deg)?\s*(?:([\d.]+)\s*')?\s*(?:([\d.]+)\s*\")?\s*([NSEW])", re.IGNORECASE)
+_ANGLE = re.compile(
+    r"([\d.]+)\s*(?:°|deg)?\s*(?:([\d.]+)\s*')?\s*(?:([\d.]+)\s*\")?\s*([NSEW])", re.IGNORECASE
+)
 _HEIGHT = re.compile(r"([-+]?[\d.,]+)\s*m(?:\s+(above|below) sea level)?", re.IGNORECASE)
 _QUOTED = re.compile(r'"([^"]*)"|(\S+)')
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]?")
@@ -56,9 +64,14 @@ def cells_of(line: str, separator: str) -> list[str]:
 
 
 def file_joined(words: list[str], at: int) -> list[str]:
-    """Words with those from one on joined as far as the ending of a file, whose name may have blanks."""
+    """Words with those from one on joined as far as the ending of a file, whose name may have
+    blanks."""
     end = next((k for k in range(at, len(words)) if is_file(words[k])), at)
-    return [*words[:at], " ".join(words[at : end + 1]), *words[end + 1 :]] if at < len(words) else words
+    return (
+        [*words[:at], " ".join(words[at : end + 1]), *words[end + 1 :]]
+        if at < len(words)
+        else words
+    )
 
 
 def is_file(word: str) -> bool:
@@ -67,7 +80,8 @@ def is_file(word: str) -> bool:
 
 
 def title_of(cell: str) -> tuple[str, float]:
-    """The letters of a column's name without its unit, in small ones, and the unit; NaN: the name does not say it."""
+    """The letters of a column's name without its unit, in small ones, and the unit; NaN: the name
+    does not say it."""
     units = [letters(part) for part in _BRACKETS.findall(cell)]
     words = re.findall(r"[^\W\d_]+", _BRACKETS.split(cell)[0])
     if len(words) > 1 and words[-1].lower() in UNITS:
@@ -86,8 +100,8 @@ def is_value(cell: str) -> bool:
 
 
 def value_of(cell: str, field: str, where: str) -> float:
-    """The number of a cell, also with a decimal comma; NaN if it says that there is none. Raises ProblemError,
-    beginning with `where`: it says something else."""
+    """The number of a cell, also with a decimal comma; NaN if it says that there is none. Raises
+    ProblemError, beginning with `where`: it says something else."""
     if cell.strip().lower() in NO_VALUE:
         return np.nan
     plain = re.sub(r"[\s']", "", cell)
@@ -100,7 +114,8 @@ def value_of(cell: str, field: str, where: str) -> float:
 
 
 def plain(cell: str) -> str:
-    """The number of a cell as ExifTool writes coordinates: `47 deg 18' 5.25" S`, `12.5 m Below Sea Level`."""
+    """The number of a cell as ExifTool writes coordinates: `47 deg 18' 5.25" S`, `12.5 m Below Sea
+    Level`."""
     angle = _ANGLE.fullmatch(cell)
     if angle is not None:
         parts = [float(part or 0) for part in angle.groups()[:3]]
@@ -113,7 +128,8 @@ def plain(cell: str) -> str:
 
 
 def has_fix(places: Float[np.ndarray, "n 3"], degrees: bool) -> Bool[np.ndarray, " n"]:
-    """Which places are such: all numbers are there, and they are not those of a receiver without a fix.
+    """Which places are such: all numbers are there, and they are not those of a receiver without a
+    fix.
 
     Those are latitude and longitude 0, or no angles; or x and y 0, far away from all others.
 

@@ -1,4 +1,5 @@
-"""Reader of lines, of whitespace-separated numbers, and of points among them; every error names its line."""
+"""Reader of lines, of whitespace-separated numbers, and of points among them; every error names its
+line."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from jaxba.io.decimals import SMALL, number, parse
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
 
-BLOCK_BYTES = 1 << 22  # bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache
+# bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache
+BLOCK_BYTES = 1 << 22
 SHOWN = 40  # characters of a wrong word that a message shows
 
 _SPACE = re.compile(rb"[ \t\n\r\v\f]")
@@ -28,7 +30,8 @@ def shown_word(word: bytes) -> str:
 
 
 def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
-    """Words as finite numbers; `fields` are their names. Raises ProblemError, beginning with `where`: one is not."""
+    """Words as finite numbers; `fields` are their names. Raises ProblemError, beginning with
+    `where`: one is not."""
     found = []
     for word, field in zip(words, fields, strict=True):
         text = word if isinstance(word, str) else word.decode("latin-1")
@@ -44,17 +47,22 @@ def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: s
 class Text:
     """The text of a file: lines one after the other, then the numbers in all that follows.
 
-    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0."""
+    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from
+    0."""
 
     def __init__(self, pieces: Iterable[bytes], name: str):
         """`pieces` of the text of the file called `name`, with lines that end in LF."""
         self.name = name
         self.line = 0  # number of the line that was read last, from 1
         self.values = np.empty(0)  # the numbers that are kept, up to the first word that is none
-        self.field: Callable[[int], str]  # what the number at an ordinal is; may be replaced while reading
-        self._pieces, self._text, self._at = iter(pieces), b"", 0  # what follows, and where in it the next line begins
-        self._blocks: list[tuple[int, int, bytes]] = []  # those kept: ordinal of the first number, lines before, text
-        self._start = self._count = 0  # ordinals of the first number that is kept, and of the next one to read
+        # what the number at an ordinal is; may be replaced while reading
+        self.field: Callable[[int], str]
+        # what follows, and where in it the next line begins
+        self._pieces, self._text, self._at = iter(pieces), b"", 0
+        # those kept: ordinal of the first number, lines before, text
+        self._blocks: list[tuple[int, int, bytes]] = []
+        # ordinals of the first number that is kept, and of the next one to read
+        self._start = self._count = 0
         self._last = 0, b""  # lines before the last block that is not blank, and its text
         self._complaint: str | None = None  # about the word after the last number
 
@@ -64,7 +72,8 @@ class Text:
         return f"{self.name} line {max(self.line, 1)}"
 
     def next_line(self) -> bytes:
-        """The next line that is not blank, without blanks at its ends; empty at the end of the text."""
+        """The next line that is not blank, without blanks at its ends; empty at the end of the
+        text."""
         line = b""
         while not line:
             while (end := self._text.find(b"\n", self._at)) < 0 and self._more():
@@ -86,7 +95,8 @@ class Text:
         return self.values
 
     def number_blocks(self, field: Callable[[int], str]) -> Iterator[range]:
-        """Parses the same a block at a time. Yields ordinals of its numbers, which until the next one are `values`."""
+        """Parses the same a block at a time. Yields ordinals of its numbers, which until the next
+        one are `values`."""
         self.field, lines, last = field, self.line, False
         self._last = max(lines - 1, 0), b""
         while not last and self._complaint is None:
@@ -104,20 +114,26 @@ class Text:
             yield range(self._start, self._count)
 
     def need(self, count: int) -> None:
-        """Refuses a text of fewer numbers. Raises ProblemError: it says why there are no more of them."""
+        """Refuses a text of fewer numbers. Raises ProblemError: it says why there are no more of
+        them."""
         if count > self._count and self._complaint is not None:
             self.fail(self._count, self._complaint)
         if count > self._count:
             line = self._last[0] + self._last[1].rstrip().count(b"\n") + 1
-            raise ProblemError(f"{self.name} line {line}: the file ends before the {self.field(self._count)}")
+            raise ProblemError(
+                f"{self.name} line {line}: the file ends before the {self.field(self._count)}"
+            )
 
     def finish(self, count: int) -> None:
         """Refuses a text in which a word follows so many numbers. Raises ProblemError."""
         if count < self._count or self._complaint is not None:
             self.fail(count, "is left over after the last number", field="")
 
-    def integers(self, ordinals: range | Sequence[int] | np.ndarray, low: int, high: int) -> np.ndarray:
-        """The numbers at some ordinals as int32. Raises ProblemError: one is no integer in `[low, high]`."""
+    def integers(
+        self, ordinals: range | Sequence[int] | np.ndarray, low: int, high: int
+    ) -> np.ndarray:
+        """The numbers at some ordinals as int32. Raises ProblemError: one is no integer in `[low,
+        high]`."""
         values = self.at(ordinals)
         whole = values == np.floor(values)
         bad = np.flatnonzero(~(whole & (values >= low) & (values <= high)))
@@ -129,18 +145,24 @@ class Text:
     def at(self, ordinals: range | Sequence[int] | np.ndarray) -> np.ndarray:
         """The numbers at some ordinals that are kept."""
         if isinstance(ordinals, range):
-            return self.values[ordinals.start - self._start : max(ordinals.stop - self._start, 0) : ordinals.step]
+            return self.values[
+                ordinals.start - self._start : max(ordinals.stop - self._start, 0) : ordinals.step
+            ]
         return self.values[np.asarray(ordinals) - self._start]
 
     def fail(self, ordinal: int, complaint: str, *, field: str | None = None) -> NoReturn:
         """Raises a `ProblemError` about the number (or bad word) at an ordinal."""
-        first, lines, text = self._blocks[bisect_right(self._blocks, ordinal, key=lambda block: block[0]) - 1]
+        first, lines, text = self._blocks[
+            bisect_right(self._blocks, ordinal, key=lambda block: block[0]) - 1
+        ]
         for word in _WORD.finditer(text):
             if first == ordinal:
                 field = self.field(ordinal) if field is None else field
                 line = lines + text.count(b"\n", 0, word.start()) + 1
                 of = f" ({field})" if field else ""
-                raise ProblemError(f"{self.name} line {line}: {shown_word(word[0])} {complaint}{of}")
+                raise ProblemError(
+                    f"{self.name} line {line}: {shown_word(word[0])} {complaint}{of}"
+                )
             first += 1
         raise AssertionError("the text has such a word")
 
@@ -163,10 +185,11 @@ VIEW_FIELDS = ("camera index", "key", "x", "y")
 def read_tracks(
     text: Text, start: int, count: int, num_cameras: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-    """Reads points and their views, as Bundler writes them, from the position of the first one's x among the numbers of
-    a text, whose `field` describes those before the points. Returns positions (count, 3); of each view camera, point
-    and pixel (views, 2); the position after the last number. Raises ProblemError: the file ends early, or something is
-    no number or out of range; or there are no views."""
+    """Reads points and their views, as Bundler writes them, from the position of the first one's x
+    among the numbers of a text, whose `field` describes those before the points. Returns positions
+    (count, 3); of each view camera, point and pixel (views, 2); the position after the last number.
+    Raises ProblemError: the file ends early, or something is no number or out of range; or there
+    are no views."""
     values, before, starts, end = text.values, text.field, [], start
 
     def field(ordinal: int) -> str:
@@ -189,7 +212,13 @@ def read_tracks(
     if not camera_index.size:
         raise ProblemError(f"{text.name}: no camera sees a point")
     points = values[first_view[:, None] - len(POINT_FIELDS) + np.arange(3)]
-    return points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], end
+    return (
+        points,
+        camera_index,
+        np.repeat(np.arange(count), views),
+        values[at[:, None] + [2, 3]],
+        end,
+    )
 
 
 def _point_field(point: int, at: int) -> str:
@@ -200,7 +229,8 @@ def _point_field(point: int, at: int) -> str:
 
 
 def numbered(index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """For each entry how many of the same value stand before it: numbers of key-points, from an index of cameras."""
+    """For each entry how many of the same value stand before it: numbers of key-points, from an
+    index of cameras."""
     counts = np.bincount(index)
     numbers = np.arange(len(index), dtype=np.int32)
     numbers -= np.repeat((np.cumsum(counts) - counts).astype(np.int32), counts)
@@ -213,4 +243,8 @@ def grouped(index: Int[np.ndarray, " n"], bound: int) -> Int[np.ndarray, " n"]:
     from scipy.sparse import csr_array
 
     rows = np.arange(len(index) + 1, dtype=np.int32)
-    return csr_array((np.ones(len(index), np.int8), index, rows), shape=(len(index), bound)).tocsc().indices
+    return (
+        csr_array((np.ones(len(index), np.int8), index, rows), shape=(len(index), bound))
+        .tocsc()
+        .indices
+    )

@@ -11,29 +11,35 @@ from jaxba.kitti.triangulate import Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 
-FLIP = np.diag(COLMAP_FLIP)  # from axes x right, y down, z forward (KITTI, COLMAP) to x right, y up, z backward (BAL)
+# from axes x right, y down, z forward (KITTI, COLMAP) to x right, y up, z backward (BAL)
+FLIP = np.diag(COLMAP_FLIP)
 MIN_OBSERVATIONS = 10  # observations that a camera needs: 20 residuals for its 9 parameters
 
 
 Frames = tuple[int, ...]  # frame number of every camera
 
 
-def assemble(tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build) -> BundleProblem:
+def assemble(
+    tracks: Tracks, views: Views, calibration: Calibration, frames: Frames, options: Build
+) -> BundleProblem:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
-    Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical pixels are
-    scaled by fx / fy. The images of the tracks are the views, which are world to camera, looking down +z; `frames` are
-    their numbers, and `options` has the limits for points. Raises ProblemError: a camera would see fewer than 10
-    points."""
+    Every camera starts with the focal length fx and without distortion. Where fy differs from fx,
+    vertical pixels are scaled by fx / fy. The images of the tracks are the views, which are world
+    to camera, looking down +z; `frames` are their numbers, and `options` has the limits for points.
+    Raises ProblemError: a camera would see fewer than 10 points."""
     rays = calibration.rays(tracks.pixels)
     observations = Observations(tracks.image, tracks.track, rays)
     error = options.max_error / calibration.fx
-    points, keep = triangulate_robustly(views, observations, options.min_angle, error, options.min_views)
+    points, keep = triangulate_robustly(
+        views, observations, options.min_angle, error, options.min_views
+    )
     seen = np.bincount(tracks.image[keep], minlength=len(frames))
     if seen.min() < MIN_OBSERVATIONS:
         bad = int(seen.argmin())
         raise ProblemError(
-            f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least {MIN_OBSERVATIONS} are needed; "
+            f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least "
+            f"{MIN_OBSERVATIONS} are needed; "
             "choose other --frames or --start, or a smaller --min-angle"
         )
     names, point_index = np.unique(tracks.track[keep], return_inverse=True)

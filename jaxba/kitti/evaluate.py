@@ -1,8 +1,9 @@
-"""Trajectory errors of a problem and its solutions against the ground truth, after a similarity alignment.
+"""Trajectory errors of a problem and its solutions against the ground truth, after a similarity
+alignment.
 
-A trajectory is a stack of camera-to-world poses `[R | c]`, shape (poses, 3, 4), in the order of time. Definitions are
-those of evo (`evo_ape -a -s`, `evo_rpe -a -s`) and of the KITTI odometry development kit; each function names its own.
-"""
+A trajectory is a stack of camera-to-world poses `[R | c]`, shape (poses, 3, 4), in the order of
+time. Definitions are those of evo (`evo_ape -a -s`, `evo_rpe -a -s`) and of the KITTI odometry
+development kit; each function names its own."""
 
 from __future__ import annotations
 
@@ -46,25 +47,32 @@ class SegmentErrors(NamedTuple):
 
 
 def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
-    """Distances between camera centres, in units of the truth; `rmse` is the ATE, as `evo_ape -a -s` prints it.
+    """Distances between camera centres, in units of the truth; `rmse` is the ATE, as `evo_ape -a
+    -s` prints it.
 
-    Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", section IV.B."""
+    Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", section
+    IV.B."""
     return _statistics(np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1))
 
 
 def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
-    """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE with a delta of one.
+    """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE
+    with a delta of one.
 
-    The estimate must have the truth's scale; its rotation and position do not matter. Returns the errors of
-    translations, in units of the truth, and of rotations, degrees."""
+    The estimate must have the truth's scale; its rotation and position do not matter. Returns the
+    errors of translations, in units of the truth, and of rotations, degrees."""
     error = _motion(_motion(truth[:-1], truth[1:]), _motion(aligned[:-1], aligned[1:]))
     return _statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error))
 
 
-def segment_errors(aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS) -> SegmentErrors | None:
-    """Errors over segments of the true path, per metre; None if the path is too short for all of them.
+def segment_errors(
+    aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS
+) -> SegmentErrors | None:
+    """Errors over segments of the true path, per metre; None if the path is too short for all of
+    them.
 
-    A segment of length L goes from every tenth pose to the first that is more than L farther along the true path.
+    A segment of length L goes from every tenth pose to the first that is more than L farther along
+    the true path.
 
     Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`)."""
     steps = np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=1)
@@ -92,7 +100,10 @@ def path_length(poses: Poses) -> float:
 
 def _statistics(errors: np.ndarray) -> Errors:
     return Errors(
-        float(np.sqrt((errors**2).mean())), float(errors.mean()), float(np.median(errors)), float(errors.max())
+        float(np.sqrt((errors**2).mean())),
+        float(errors.mean()),
+        float(np.median(errors)),
+        float(errors.max()),
     )
 
 
@@ -108,7 +119,9 @@ def _angles(poses: Poses) -> Float[np.ndarray, " poses"]:
     return np.rad2deg(Rotation.from_matrix(poses[:, :, :3]).magnitude())
 
 
-def score(poses: Float[np.ndarray, "cameras 3 4"], truth: Float[np.ndarray, "cameras 3 4"]) -> dict[str, Any]:
+def score(
+    poses: Float[np.ndarray, "cameras 3 4"], truth: Float[np.ndarray, "cameras 3 4"]
+) -> dict[str, Any]:
     """A trajectory's errors after alignment, metres and degrees. Raises ProblemError."""
     similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
     aligned = similarity.poses(poses)
@@ -128,14 +141,17 @@ def evaluate(
     side: Sidecar,
     truth: Float[np.ndarray, "cameras 3 4"] | None,
 ) -> list[tuple[dict[str, Any], Float[np.ndarray, "cameras 3 4"]]]:
-    """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
-    Returns of each: name, sizes, reprojection error and, with a truth, `score`; and its aligned poses. Raises
-    ProblemError: a file cannot be read, has other cameras than the sidecar file, or cannot be aligned."""
+    """A problem and its solutions, each aligned with the truth on its own; without a truth, with
+    the first camera. Returns of each: name, sizes, reprojection error and, with a truth, `score`;
+    and its aligned poses. Raises ProblemError: a file cannot be read, has other cameras than the
+    sidecar file, or cannot be aligned."""
     results = []
     for path in paths:
         problem = read_problem(path)
         if problem.num_cameras != len(side.frames):
-            counts = f"{problem.num_cameras} cameras, the sidecar file names {len(side.frames)} frames"
+            counts = (
+                f"{problem.num_cameras} cameras, the sidecar file names {len(side.frames)} frames"
+            )
             raise ProblemError(f"{display_name(path)}: has {counts}")
         poses = geometry.camera_poses(problem.cameras)
         numbers = {
@@ -150,7 +166,8 @@ def evaluate(
             json.dumps(numbers, allow_nan=False)
         except ValueError:
             raise ProblemError(
-                f"{display_name(path)}: an error is not finite: a camera or point lies where it cannot"
+                f"{display_name(path)}: an error is not finite: a camera or point lies where it "
+                "cannot"
             ) from None
         if truth is None:
             similarity = Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
@@ -163,4 +180,8 @@ def evaluate(
 def write_poses(path: StrPath, poses: Float[np.ndarray, "cameras 3 4"]) -> None:
     """Writes 12 numbers per line and pose, as KITTI and evo read them. Raises ProblemError."""
     with open_output(path) as file:
-        file.write("".join(" ".join(map(repr, row)) + "\n" for row in poses.reshape(-1, 12).tolist()).encode())
+        file.write(
+            "".join(
+                " ".join(map(repr, row)) + "\n" for row in poses.reshape(-1, 12).tolist()
+            ).encode()
+        )

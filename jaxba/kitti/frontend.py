@@ -28,12 +28,13 @@ def build(
     poses_of_frames: Callable[[tuple[int, ...]], Float[np.ndarray, "frames 3 4"]] | None,
     report: Report,
 ) -> tuple[BundleProblem, Frames, int]:
-    """Makes the problem of a sequence: it, its key-frames, and how many tracks they had. Repeatable.
+    """Makes the problem of a sequence: it, its key-frames, and how many tracks they had.
+    Repeatable.
 
-    Notes say which frames could not be matched with the others, or placed by known points. `poses_of_frames` gives
-    camera-to-world poses of frames by their numbers; it is needed where the initial poses are given. `report` is called
-    with the progress. Raises ProblemError: an image cannot be read, frames share too little, or the camera does not
-    move."""
+    Notes say which frames could not be matched with the others, or placed by known points.
+    `poses_of_frames` gives camera-to-world poses of frames by their numbers; it is needed where the
+    initial poses are given. `report` is called with the progress. Raises ProblemError: an image
+    cannot be read, frames share too little, or the camera does not move."""
     every, linked = link(sequence, options, report)
     numbers = tuple(sequence.numbers[i] for i in linked)
     chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)
@@ -41,7 +42,9 @@ def build(
     tracks, restarts = every.restrict(chosen), ()
     if options.start == "vo":
         report(f"visual odometry ({len(frames)})")
-        views, restarts = visual_odometry(tracks, len(frames), sequence.calibration, options, frames)
+        views, restarts = visual_odometry(
+            tracks, len(frames), sequence.calibration, options, frames
+        )
     else:
         assert poses_of_frames is not None
         views = views_of_poses(poses_of_frames(frames))
@@ -49,7 +52,10 @@ def build(
     whole = assemble(tracks, views, sequence.calibration, frames, options)
     for words, left in (
         ("left out, too few matches", sorted(set(sequence.numbers) - set(numbers))),
-        ("placed relative to the key-frame beside, without enough known points", [frames[i] for i in restarts]),
+        (
+            "placed relative to the key-frame beside, without enough known points",
+            [frames[i] for i in restarts],
+        ),
     ):
         if left:
             report_notes([f"{words}: frame{'s'[: len(left) > 1]} {', '.join(map(str, left))}"])
@@ -57,12 +63,15 @@ def build(
 
 
 def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tuple[int, ...]]:
-    """Tracks over the frames that are linked with the first one, and the positions of these in the sequence.
+    """Tracks over the frames that are linked with the first one, and the positions of these in the
+    sequence.
 
-    The images of the tracks are positions among them. A frame not linked with one of the `reach` before it is left out.
-    Raises ProblemError: an image cannot be read, or too many frames in a row are not linked: the message names them."""
+    The images of the tracks are positions among them. A frame not linked with one of the `reach`
+    before it is left out. Raises ProblemError: an image cannot be read, or too many frames in a row
+    are not linked: the message names them."""
     read, calibration = image_reader(sequence), sequence.calibration
-    recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
+    # descriptors of a whole sequence would fill gigabytes
+    recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)
     pixels: list[np.ndarray] = []
     matches: dict[tuple[int, int], np.ndarray] = {}
     report(f"key-points and matches ({len(sequence)})")
@@ -72,7 +81,9 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         recent.append(descriptors)
         for i in range(max(j - options.reach, 0), j):
             pairs = match(recent[i - j - 1], recent[-1])
-            first, second = (calibration.rays(pixels[k][own]) for k, own in ((i, pairs[:, 0]), (j, pairs[:, 1])))
+            first, second = (
+                calibration.rays(pixels[k][own]) for k, own in ((i, pairs[:, 0]), (j, pairs[:, 1]))
+            )
             matches[i, j] = pairs[essential(first, second, EPIPOLAR_PIXELS / calibration.fx)[1]]
     linked, before = [0], [0]
     for j in range(1, len(sequence)):
@@ -86,7 +97,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         counts = sorted((k, len(found)) for (i, k), found in matches.items() if i == last)
         shares = ", ".join(f"{count} with frame {number[k]}" for k, count in counts)
         raise ProblemError(
-            f"too few matches: frame {number[last]} shares {shares}, at least {options.min_matches} are needed; "
+            f"too few matches: frame {number[last]} shares {shares}, at least "
+            f"{options.min_matches} are needed; "
             f"choose other --frames, more --keypoints or fewer --min-matches"
         )
     position = {frame: at for at, frame in enumerate(linked)}

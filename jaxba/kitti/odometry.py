@@ -1,8 +1,9 @@
 """Monocular visual odometry over key-frames: the initial poses of bundle adjustment.
 
-The relative pose of two views with enough parallax comes from an essential matrix, and their tracks are triangulated.
-The pose of every other view comes from the known points that it sees (PnP), and new points are triangulated as soon as
-the angle between their rays is large enough. The first baseline has length 1. Nothing is adjusted afterwards."""
+The relative pose of two views with enough parallax comes from an essential matrix, and their tracks
+are triangulated. The pose of every other view comes from the known points that it sees (PnP), and
+new points are triangulated as soon as the angle between their rays is large enough. The first
+baseline has length 1. Nothing is adjusted afterwards."""
 
 from __future__ import annotations
 
@@ -19,20 +20,29 @@ from jaxba.kitti.tracks import Tracks, parallax, relative_rotation
 from jaxba.kitti.triangulate import Observations, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
 
-BOOTSTRAP_ANGLE = 2.0  # median angle in degrees between the rays of the first two views that is enough
-BOOTSTRAP_MOST = 20.0  # ... beyond which the essential matrix must be wrong: points nearer than three baselines
+# median angle in degrees between the rays of the first two views that is enough
+BOOTSTRAP_ANGLE = 2.0
+# ... beyond which the essential matrix must be wrong: points nearer than three baselines
+BOOTSTRAP_MOST = 20.0
 BOOTSTRAP_ENOUGH = 5.0  # angle beyond which a pair of views is not rated higher
-BOOTSTRAP_SHARE = 0.5  # share of the common tracks that must fit the motion: a wrong motion fits few of them
-BOOTSTRAP_LEAST = 0.5  # ... and the least angle, where no pair has more; noise of a pixel is 0.1 degrees on KITTI
+# share of the common tracks that must fit the motion: a wrong motion fits few of them
+BOOTSTRAP_SHARE = 0.5
+# ... and the least angle, where no pair has more; noise of a pixel is 0.1 degrees on KITTI
+BOOTSTRAP_LEAST = 0.5
 BOOTSTRAP_REACH = 12  # how many views after the first are tried as second ones
-MIN_POINTS = 15  # inlier points that the pose of a view needs, and that the first two views must give
+# inlier points that the pose of a view needs, and that the first two views must give
+MIN_POINTS = 15
 PNP_PIXELS = 3.0  # reprojection error of an outlier
 
 PNP_ITERATIONS = 300
 
-FARTHEST = 1e9  # largest depth in baselines of points that choose the motion. With OpenCV's 50, a slow drive has none
-MIN_KNOWN = 3  # known points that the length of a step needs: the median of three tolerates one outlier
-STILL_PIXELS = 1.0  # median parallax below which a camera stands still: key-points are accurate to less than a pixel
+# largest depth in baselines of points that choose the motion. With OpenCV's 50, a slow drive has
+# none
+FARTHEST = 1e9
+# known points that the length of a step needs: the median of three tolerates one outlier
+MIN_KNOWN = 3
+# median parallax below which a camera stands still: key-points are accurate to less than a pixel
+STILL_PIXELS = 1.0
 MOVED_PIXELS = 3.0  # ... and from which on it surely moves
 SPEED_STEPS = 5  # steps whose median length per frame is used where two views share no known points
 
@@ -50,25 +60,37 @@ class _Motion(NamedTuple):
 class _Scene:
     """Poses and points that are known so far."""
 
-    def __init__(self, tracks: Tracks, views: int, calibration: Calibration, options: Build) -> None:
+    def __init__(
+        self, tracks: Tracks, views: int, calibration: Calibration, options: Build
+    ) -> None:
         self.tracks, self.focal, self.options = tracks, calibration.fx, options
-        self.observations = Observations(tracks.image, tracks.track, calibration.rays(tracks.pixels))
+        self.observations = Observations(
+            tracks.image, tracks.track, calibration.rays(tracks.pixels)
+        )
         self.views = Views(np.tile(np.eye(3), (views, 1, 1)), np.zeros((views, 3)))
         self.has_pose = np.zeros(views, bool)
         self.points = np.full((tracks.count, 3), np.nan)
 
     def place(self, view: int, rotation: np.ndarray, translation: np.ndarray) -> None:
-        """Sets the pose of a view, and triangulates all tracks that it sees from all views with known poses."""
-        self.views.rotation[view], self.views.translation[view], self.has_pose[view] = rotation, translation, True
+        """Sets the pose of a view, and triangulates all tracks that it sees from all views with
+        known poses."""
+        self.views.rotation[view], self.views.translation[view], self.has_pose[view] = (
+            rotation,
+            translation,
+            True,
+        )
         tracks = self.tracks
         rows = tracks.rows_of_tracks(tracks.track[tracks.rows_of_image(view)])
         rows = rows[self.has_pose[tracks.image[rows]]]
-        rows = rows[np.bincount(tracks.track[rows], minlength=tracks.count)[tracks.track[rows]] >= 2]
+        rows = rows[
+            np.bincount(tracks.track[rows], minlength=tracks.count)[tracks.track[rows]] >= 2
+        ]
         names, seen = self.observations.numbered(rows)
         found = triangulate(self.views, seen)
         good = found.good(seen.track, self.options.min_angle, self.options.max_error / self.focal)
         self.points[names[good]] = found.points[good]
-        known = ~good & (np.bincount(seen.track) > 2)  # two views alone may just be too close together
+        # two views alone may just be too close together
+        known = ~good & (np.bincount(seen.track) > 2)
         self.points[names[known]] = np.nan
 
     def neighbour(self, view: int) -> int:
@@ -76,9 +98,13 @@ class _Scene:
         placed = np.flatnonzero(self.has_pose)
         return int(placed[np.argmin(np.abs(placed - view))])
 
-    def after(self, near: int, rotation: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def after(
+        self, near: int, rotation: np.ndarray, translation: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The pose that is reached from that of a view by a motion."""
-        return rotation @ self.views.rotation[near], rotation @ self.views.translation[near] + translation
+        return rotation @ self.views.rotation[near], rotation @ self.views.translation[
+            near
+        ] + translation
 
     def shared(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Numbers of the tracks that two views share, and their rays in both."""
@@ -97,15 +123,21 @@ class _Scene:
         if matrix is None or inliers.sum() < MIN_POINTS:
             return None
         a, b = np.ascontiguousarray(a[inliers]), np.ascontiguousarray(b[inliers])
-        _, rotation, translation, front, _ = cv2.recoverPose(matrix, a, b, np.eye(3), distanceThresh=FARTHEST)
+        _, rotation, translation, front, _ = cv2.recoverPose(
+            matrix, a, b, np.eye(3), distanceThresh=FARTHEST
+        )
         front, rotation = np.asarray(front).ravel() > 0, np.asarray(rotation)
         if front.sum() < MIN_POINTS:
             return None
-        ahead, turned = (np.column_stack([rays, np.ones(len(rays))]) for rays in (a[front], b[front]))
+        ahead, turned = (
+            np.column_stack([rays, np.ones(len(rays))]) for rays in (a[front], b[front])
+        )
         turned = turned @ rotation
         sine = np.linalg.norm(np.cross(ahead, turned), axis=1)
         angle = np.median(np.rad2deg(np.arctan2(sine, (ahead * turned).sum(axis=1))))
-        return _Motion(rotation, np.asarray(translation).ravel(), float(angle), int(front.sum()), len(tracks))
+        return _Motion(
+            rotation, np.asarray(translation).ravel(), float(angle), int(front.sum()), len(tracks)
+        )
 
 
 def visual_odometry(
@@ -117,11 +149,12 @@ def visual_odometry(
 ) -> tuple[Views, tuple[int, ...]]:
     """Poses of all views from tracks alone.
 
-    The poses of views before the first pair with parallax (a car that stands still, or only rotates) are found last.
-    The images of the tracks are the views, 0 to `views` - 1; `names` are their frame numbers, for messages, and
-    `options` has the limits for points. Returns the poses, the first view at the origin, and the views whose pose comes
-    from the neighbouring view, for lack of known points. Raises ProblemError: no pair of views has parallax, or a view
-    shares too few tracks with its neighbour."""
+    The poses of views before the first pair with parallax (a car that stands still, or only
+    rotates) are found last. The images of the tracks are the views, 0 to `views` - 1; `names` are
+    their frame numbers, for messages, and `options` has the limits for points. Returns the poses,
+    the first view at the origin, and the views whose pose comes from the neighbouring view, for
+    lack of known points. Raises ProblemError: no pair of views has parallax, or a view shares too
+    few tracks with its neighbour."""
     scene = _Scene(tracks, views, calibration, options)
     first, second, motion = _bootstrap(scene, views, names)
     scene.place(first, np.eye(3), np.zeros(3))
@@ -136,13 +169,16 @@ def visual_odometry(
         scene.place(view, *pose)
     # the first view becomes the origin
     rotation = scene.views.rotation @ scene.views.rotation[0].T
-    return Views(rotation, scene.views.translation - rotation @ scene.views.translation[0]), tuple(restarts)
+    return Views(rotation, scene.views.translation - rotation @ scene.views.translation[0]), tuple(
+        restarts
+    )
 
 
 def _bootstrap(scene: _Scene, views: int, names: tuple[int, ...]) -> tuple[int, int, _Motion]:
     """The first two views and their motion: the best pair of the first view that has a good one.
 
-    A good pair has many inliers and enough parallax; the best one, by their product, of these or else of all."""
+    A good pair has many inliers and enough parallax; the best one, by their product, of these or
+    else of all."""
     found: list[tuple[bool, float, int, int]] = []
     motions: dict[tuple[int, int], _Motion] = {}
     largest = 0.0
@@ -160,15 +196,18 @@ def _bootstrap(scene: _Scene, views: int, names: tuple[int, ...]) -> tuple[int, 
             break
     if not found:
         raise ProblemError(
-            f"no two of the key-frames {names[0]} to {names[views - 1]} have enough parallax to start from "
-            f"(at most {largest:.2f} degrees, {BOOTSTRAP_LEAST} are needed): the camera stands still or only turns"
+            f"no two of the key-frames {names[0]} to {names[views - 1]} have enough parallax to "
+            "start from "
+            f"(at most {largest:.2f} degrees, {BOOTSTRAP_LEAST} are needed): the camera stands "
+            "still or only turns"
         )
     _, _, i, j = max(found)
     return -i, -j, motions[-i, -j]
 
 
 def _resect(scene: _Scene, view: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pose of a view by the points that it sees: P3P within RANSAC, then Levenberg-Marquardt on the inliers."""
+    """Pose of a view by the points that it sees: P3P within RANSAC, then Levenberg-Marquardt on the
+    inliers."""
     rows = scene.tracks.rows_of_image(view)
     rows = rows[np.isfinite(scene.points[scene.tracks.track[rows], 0])]
     if len(rows) < MIN_POINTS:
@@ -193,9 +232,11 @@ def _resect(scene: _Scene, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     return scene.after(near, np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift).ravel())
 
 
-def _pose_from_neighbour(scene: _Scene, view: int, names: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a view from its neighbour alone. The length of the step comes from the known points that both see, or if
-    they are too few, from the steps nearby in which the camera moved."""
+def _pose_from_neighbour(
+    scene: _Scene, view: int, names: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a view from its neighbour alone. The length of the step comes from the known points
+    that both see, or if they are too few, from the steps nearby in which the camera moved."""
     near = scene.neighbour(view)
     tracks, a, b = scene.shared(near, view)
     if scene.parallax(near, view) < STILL_PIXELS:
@@ -203,7 +244,8 @@ def _pose_from_neighbour(scene: _Scene, view: int, names: tuple[int, ...]) -> tu
     found = scene.motion(near, view)
     if found is None:
         raise ProblemError(
-            f"too few matches: key-frames {names[near]} and {names[view]} share {len(tracks)} tracks that fit one "
+            f"too few matches: key-frames {names[near]} and {names[view]} share {len(tracks)} "
+            "tracks that fit one "
             f"motion badly, {MIN_POINTS} good ones are needed; choose other --frames"
         )
     known = np.flatnonzero(np.isfinite(scene.points[tracks, 0]))
@@ -220,10 +262,13 @@ def _pose_from_neighbour(scene: _Scene, view: int, names: tuple[int, ...]) -> tu
 
 
 def _speed(scene: _Scene, near: int, names: tuple[int, ...]) -> float:
-    """Median length per frame of the nearest steps in which the camera moved; the first two views are 1 apart."""
+    """Median length per frame of the nearest steps in which the camera moved; the first two views
+    are 1 apart."""
     placed = np.flatnonzero(scene.has_pose).tolist()
     centers = scene.views.centers()
     steps = sorted(pairwise(placed), key=lambda step: abs(step[0] + step[1] - 2 * near))
-    moved = [*islice(((i, j) for i, j in steps if scene.parallax(i, j) >= MOVED_PIXELS), SPEED_STEPS)]
+    moved = [
+        *islice(((i, j) for i, j in steps if scene.parallax(i, j) >= MOVED_PIXELS), SPEED_STEPS)
+    ]
     speeds = [np.linalg.norm(centers[j] - centers[i]) / abs(names[j] - names[i]) for i, j in moved]
     return float(np.median(speeds)) if moved else 1 / abs(names[placed[-1]] - names[placed[0]])

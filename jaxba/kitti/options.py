@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-MIN_MATCHES = 40  # verified matches that link two frames: random matches of textured images reach some 15 inliers
+# verified matches that link two frames: random matches of textured images reach some 15 inliers
+MIN_MATCHES = 40
 
 
 @dataclass(frozen=True)

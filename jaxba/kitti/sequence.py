@@ -8,7 +8,8 @@ Images are those of `image_0` to `image_3`, as in the odometry benchmark. Forms 
 | the same without names | 12 numbers each; the first line is P0, that of the left grey camera |
 | `K.txt` | a 3 x 3 matrix, or one of 3 x 4 |
 
-Source: Geiger et al. 2012, "Are we ready for autonomous driving?"; the readme of the development kit."""
+Source: Geiger et al. 2012, "Are we ready for autonomous driving?"; the readme of the development
+kit."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def calibration_files(folder: Path) -> list[Path]:
 
 
 def read_calibration(path: StrPath, camera: int = 0) -> Calibration:
-    """Calibration of a camera from a file or a sequence's folder. Raises ProblemError: none, or malformed."""
+    """Calibration of a camera from a file or a sequence's folder. Raises ProblemError: none, or
+    malformed."""
     place: Path | None = Path(path)
     if place.is_dir():
         place = next((one for one in calibration_files(place) if one.is_file()), None)
@@ -44,7 +46,9 @@ def read_calibration(path: StrPath, camera: int = 0) -> Calibration:
     fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
     zeros = matrix[[0, 1, 2, 2], [1, 0, 0, 1]]
     if not (fx > 0 and fy > 0 and matrix[2, 2] == 1 and not zeros.any()):
-        raise ProblemError(f"{name}: the matrix of camera {camera} is not [[f, 0, cx], [0, f, cy], [0, 0, 1]]")
+        raise ProblemError(
+            f"{name}: the matrix of camera {camera} is not [[f, 0, cx], [0, f, cy], [0, 0, 1]]"
+        )
     offset = np.linalg.solve(matrix[:, :3], matrix[:, 3])
     return Calibration(fx, fy, float(matrix[0, 2]), float(matrix[1, 2]), tuple(offset.tolist()))
 
@@ -60,7 +64,9 @@ def _matrix(lines: list[str], name: str, camera: int) -> Float[np.ndarray, "3 4"
     widths = {len(line.split()) for line in lines}
     if widths == {12}:
         if camera >= len(lines):
-            raise ProblemError(f"{name}: has {len(lines)} lines of 12 numbers, none for camera {camera}")
+            raise ProblemError(
+                f"{name}: has {len(lines)} lines of 12 numbers, none for camera {camera}"
+            )
         return numbers_of(lines[camera], 12, f"{name} line {camera + 1}").reshape(3, 4)
     if len(lines) not in (1, 3):
         raise ProblemError(f"{name}: neither lines such as 'P0: 12 numbers' nor a 3 x 3 matrix")
@@ -89,11 +95,14 @@ class Sequence:
         return len(self.numbers)
 
 
-def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibration: StrPath | None = None) -> Sequence:
-    """The frames of a range. No image is opened yet. Hidden files, such as a Mac's `._000000.png`, are no images. The
-    range is `first:end` or `first:end:step` by frame number, the end not included, as a Python slice. Cameras 0 and 1
-    are KITTI's grey ones, 2 and 3 the coloured ones; `calibration` is the file of the camera matrix, if it is not that
-    of the folder. Raises ProblemError: no folder, images or calibration, or a range outside the sequence."""
+def read_sequence(
+    folder: StrPath, frames: str = ":", camera: int = 0, calibration: StrPath | None = None
+) -> Sequence:
+    """The frames of a range. No image is opened yet. Hidden files, such as a Mac's `._000000.png`,
+    are no images. The range is `first:end` or `first:end:step` by frame number, the end not
+    included, as a Python slice. Cameras 0 and 1 are KITTI's grey ones, 2 and 3 the coloured ones;
+    `calibration` is the file of the camera matrix, if it is not that of the folder. Raises
+    ProblemError: no folder, images or calibration, or a range outside the sequence."""
     root, name = Path(folder), display_name(folder)
     if not root.is_dir():
         raise ProblemError(f"{name}: no such folder")
@@ -102,15 +111,25 @@ def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibrati
         raise ProblemError(f"{name}: has no folder image_{camera}{_other_camera(root)}")
     found = _image_files(images)
     if not found:
-        raise ProblemError(f"{display_name(images)}: holds no images ({', '.join(SUFFIXES)}){_other_camera(root)}")
+        raise ProblemError(
+            f"{display_name(images)}: holds no images ({', '.join(SUFFIXES)}){_other_camera(root)}"
+        )
     numbered = {int(path.stem) if path.stem.isdecimal() else -1: path for path in found}
     if -1 in numbered or len(numbered) < len(found):
         bad = next((p for p in found if not p.stem.isdecimal()), found[0])
-        raise ProblemError(f"{display_name(bad)}: the name of an image must be its frame's number, and no two the same")
-    chosen = [number for number in sorted(numbered) if number in _range(frames, name, max(numbered) + 1)]
+        raise ProblemError(
+            f"{display_name(bad)}: the name of an image must be its frame's number, and no two the "
+            "same"
+        )
+    chosen = [
+        number for number in sorted(numbered) if number in _range(frames, name, max(numbered) + 1)
+    ]
     if len(chosen) < 2:
         last = max(numbered)
-        raise ProblemError(f"{name}: --frames {frames} leaves {len(chosen)} of frames {min(numbered)} to {last}, not 2")
+        raise ProblemError(
+            f"{name}: --frames {frames} leaves {len(chosen)} of frames {min(numbered)} to {last}, "
+            "not 2"
+        )
     return Sequence(
         images,
         tuple(chosen),
@@ -126,7 +145,11 @@ def _image_files(folder: Path) -> list[Path]:
 
 def _other_camera(root: Path) -> str:
     """A hint at the cameras that have images, as the end of a message."""
-    there = [one for one in CAMERAS if (root / f"image_{one}").is_dir() and _image_files(root / f"image_{one}")]
+    there = [
+        one
+        for one in CAMERAS
+        if (root / f"image_{one}").is_dir() and _image_files(root / f"image_{one}")
+    ]
     if not there:
         return ""
     names = " and ".join(f"image_{one}" for one in there)
@@ -136,7 +159,9 @@ def _other_camera(root: Path) -> str:
 def _range(frames: str, name: str, count: int) -> range:
     match = re.fullmatch(r"(\d*):(\d*)(?::(\d+))?", frames.strip())
     if match is None or match[3] == "0":
-        raise ProblemError(f"--frames must be first:end or first:end:step, such as 0:200, is {frames!r}")
+        raise ProblemError(
+            f"--frames must be first:end or first:end:step, such as 0:200, is {frames!r}"
+        )
     first, end, step = (int(part) if part else None for part in match.groups())
     if end is not None and end > count:
         raise ProblemError(f"{name}: --frames {frames} ends after the last frame, {count - 1}")

@@ -1,4 +1,5 @@
-"""Tracks: key-points of several images that are the same point of the scene; and the key-frames to choose by them."""
+"""Tracks: key-points of several images that are the same point of the scene; and the key-frames to
+choose by them."""
 
 from __future__ import annotations
 
@@ -36,7 +37,9 @@ class Tracks:
     def _by_image(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows sorted by image, and the first one of each image (one more entry than images)."""
         order = np.argsort(self.image, kind="stable")
-        return order, np.searchsorted(self.image[order], np.arange(int(self.image.max(initial=-1)) + 2))
+        return order, np.searchsorted(
+            self.image[order], np.arange(int(self.image.max(initial=-1)) + 2)
+        )
 
     def rows_of_image(self, image: int) -> Int[np.ndarray, " m"]:
         """Rows of the observations in an image, in the order of their tracks."""
@@ -44,25 +47,29 @@ class Tracks:
         return order[start[image] : start[image + 1]] if 0 <= image < len(start) - 1 else order[:0]
 
     def rows_of_tracks(self, tracks: Int[np.ndarray, " k"]) -> Int[np.ndarray, " m"]:
-        """Rows of all observations of some tracks (in ascending order), in the order of the table."""
+        """Rows of all observations of some tracks (in ascending order), in the order of the
+        table."""
         first, end = (np.searchsorted(self.track, tracks, side=side) for side in ("left", "right"))
         sizes = end - first
         return np.repeat(first - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
 
     def shared(self, a: int, b: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-        """Rows of the tracks that both images see: those in image a, those in image b, in the same order."""
+        """Rows of the tracks that both images see: those in image a, those in image b, in the same
+        order."""
         rows_a, rows_b = self.rows_of_image(a), self.rows_of_image(b)
         _, at_a, at_b = np.intersect1d(self.track[rows_a], self.track[rows_b], return_indices=True)
         return rows_a[at_a], rows_b[at_b]
 
     def keep(self, rows: np.ndarray) -> Tracks:
-        """The observations that a mask selects, of tracks that then still have two; tracks are renumbered."""
+        """The observations that a mask selects, of tracks that then still have two; tracks are
+        renumbered."""
         image, track, pixels = self.image[rows], self.track[rows], self.pixels[rows]
         long = np.bincount(track, minlength=self.count)[track] >= 2
         return Tracks(image[long], np.unique(track[long], return_inverse=True)[1], pixels[long])
 
     def restrict(self, images: Sequence[int]) -> Tracks:
-        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than two are dropped."""
+        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than two are
+        dropped."""
         new = np.full(int(self.image.max(initial=-1)) + 1, -1)
         wanted = np.asarray(images, int)
         new[wanted[wanted < len(new)]] = np.flatnonzero(wanted < len(new))
@@ -79,17 +86,22 @@ def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> Tra
 
 
 def join_matches(
-    pixels: Sequence[Float[np.ndarray, "_ 2"]], matches: Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]]
+    pixels: Sequence[Float[np.ndarray, "_ 2"]],
+    matches: Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]],
 ) -> Tracks:
     """Tracks from matches of pairs of images: the connected components of matched key-points.
 
-    A component with two key-points of one image cannot be one point. It is split into the chains of matches between
-    images next to each other: these are one to one, so a chain has no two key-points of one image. `pixels` are the
-    key-points of every image; `matches` of a pair of images (i < j) are pairs of key-points, one to one."""
+    A component with two key-points of one image cannot be one point. It is split into the chains of
+    matches between images next to each other: these are one to one, so a chain has no two
+    key-points of one image. `pixels` are the key-points of every image; `matches` of a pair of
+    images (i < j) are pairs of key-points, one to one."""
     sizes = [len(points) for points in pixels]
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     image = np.repeat(np.arange(len(pixels)), sizes)
-    edges = {pair: first[list(pair)] + np.asarray(found, np.int64).reshape(-1, 2) for pair, found in matches.items()}
+    edges = {
+        pair: first[list(pair)] + np.asarray(found, np.int64).reshape(-1, 2)
+        for pair, found in matches.items()
+    }
     label = _components(len(image), list(edges.values()))
     order = np.lexsort((image, label))
     twice = (np.diff(label[order]) == 0) & (np.diff(image[order]) == 0)
@@ -101,40 +113,55 @@ def join_matches(
 
 def _components(count: int, edges: Sequence[np.ndarray]) -> np.ndarray:
     pairs = np.concatenate([np.empty((0, 2), np.int64), *edges])
-    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    graph = coo_matrix(
+        (np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
+    )
     return connected_components(graph, directed=False)[1]
 
 
-PARALLAX = 10.0  # median parallax of a key-frame of `auto`, pixels. VINS-Mono (Qin et al. 2018): 10 at focal length 460
+# median parallax of a key-frame of `auto`, pixels. VINS-Mono (Qin et al. 2018): 10 at focal length
+# 460
+PARALLAX = 10.0
 SHARE = 0.5  # ... as it does when less than this share of the tracks of the last key-frame is left
 MIN_SHARED = 20  # tracks that neighbouring key-frames must share, to estimate their relative pose
 
 
-def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], focal: float) -> float:
-    """Median image motion in pixels that no rotation of the camera explains; zero for a camera that only rotates.
+def parallax(
+    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], focal: float
+) -> float:
+    """Median image motion in pixels that no rotation of the camera explains; zero for a camera that
+    only rotates.
 
-    The rotation is the least-squares fit to the rays, which absorbs a little of a translation where the scene is far.
+    The rotation is the least-squares fit to the rays, which absorbs a little of a translation where
+    the scene is far.
 
     Rays are `(X / Z, Y / Z)`, the focal length is in pixels."""
     rotated = np.column_stack([first, np.ones(len(first))]) @ relative_rotation(first, second).T
     return float(focal * np.median(np.linalg.norm(perspective(rotated) - second, axis=1)))
 
 
-def relative_rotation(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3 3"]:
+def relative_rotation(
+    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, "3 3"]:
     """The least-squares rotation from the rays of one view to those of another."""
     a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (first, second))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     return Rotation.align_vectors(b, a)[0].as_matrix()
 
 
-def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, numbers: tuple[int, ...]) -> list[int]:
-    """Which of so many images are key-frames. The choice is `auto` (by parallax and by the share of tracks left),
-    `all`, or a number N for every N-th; `numbers` are the frame numbers of the images, for messages. Raises
-    ProblemError: the choice is none of these, the camera does not move, or neighbours share too few tracks."""
+def choose(
+    tracks: Tracks, images: int, choice: str, calibration: Calibration, numbers: tuple[int, ...]
+) -> list[int]:
+    """Which of so many images are key-frames. The choice is `auto` (by parallax and by the share of
+    tracks left), `all`, or a number N for every N-th; `numbers` are the frame numbers of the
+    images, for messages. Raises ProblemError: the choice is none of these, the camera does not
+    move, or neighbours share too few tracks."""
     if choice != "auto":
         step = 1 if choice == "all" else int(choice) if re.fullmatch(r"[1-9]\d{0,8}", choice) else 0
         if not step:
-            raise ProblemError(f"--keyframes must be auto, all or a number such as 2, is {choice!r}")
+            raise ProblemError(
+                f"--keyframes must be auto, all or a number such as 2, is {choice!r}"
+            )
         chosen = list(range(0, images, step))
     else:
         chosen = [0]
@@ -142,13 +169,18 @@ def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, n
         for i in range(1, images):
             a, b = tracks.shared(chosen[-1], i)
             own = len(tracks.rows_of_image(chosen[-1]))
-            if len(a) < max(SHARE * own, MIN_SHARED) or parallax(rays[a], rays[b], calibration.fx) >= PARALLAX:
+            if (
+                len(a) < max(SHARE * own, MIN_SHARED)
+                or parallax(rays[a], rays[b], calibration.fx) >= PARALLAX
+            ):
                 chosen.append(i)
     if len(chosen) < 2:
         where = f"frames {numbers[0]} to {numbers[images - 1]}"
         if choice == "auto":
             raise ProblemError(f"the camera hardly moves in {where}: one key-frame")
-        raise ProblemError(f"--keyframes {choice} leaves one key-frame of {images} in {where}, not 2")
+        raise ProblemError(
+            f"--keyframes {choice} leaves one key-frame of {images} in {where}, not 2"
+        )
     for i, j in pairwise(chosen):
         shared = len(tracks.shared(i, j)[0])
         if shared < MIN_SHARED:

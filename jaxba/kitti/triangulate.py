@@ -1,6 +1,7 @@
 """Triangulation of many tracks at once, from cameras with known poses.
 
-Cameras here look down +z: a point `X` of the world is at `R X + t`, and its ray is `(x / z, y / z)`."""
+Cameras here look down +z: a point `X` of the world is at `R X + t`, and its ray is `(x / z, y /
+z)`."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.geometry import perspective, translations
 
-GAUSS_NEWTON_STEPS = 6  # Gauss-Newton steps of a point after the linear solution; three are enough on most tracks
+# Gauss-Newton steps of a point after the linear solution; three are enough on most tracks
+GAUSS_NEWTON_STEPS = 6
 SMALLEST = 1e-12  # damping of the linear systems of a point, relative, for rays that are parallel
 
 
@@ -44,7 +46,8 @@ class Observations(NamedTuple):
     rays: Float[np.ndarray, "n 2"]
 
     def numbered(self, rows: np.ndarray) -> tuple[Int[np.ndarray, " tracks"], Observations]:
-        """Numbers of the tracks of some rows, and these rows, whose tracks have positions among them as numbers."""
+        """Numbers of the tracks of some rows, and these rows, whose tracks have positions among
+        them as numbers."""
         names, track = np.unique(self.track[rows], return_inverse=True)
         return names, Observations(self.camera[rows], track, self.rays[rows])
 
@@ -55,17 +58,20 @@ class Triangulated(NamedTuple):
     points: Float[np.ndarray, "tracks 3"]
     angle: Float[np.ndarray, " tracks"]  # largest between the first ray and any other, degrees
     depth: Float[np.ndarray, " n"]  # of each observation
-    error: Float[np.ndarray, " n"]  # distance of each ray from the point's, in units of the focal length
+    # distance of each ray from the point's, in units of the focal length
+    error: Float[np.ndarray, " n"]
 
     def good(self, track: np.ndarray, angle: float, error: float) -> Bool[np.ndarray, " tracks"]:
-        """Tracks whose point lies in front of all its cameras, with an angle and errors within these limits."""
+        """Tracks whose point lies in front of all its cameras, with an angle and errors within
+        these limits."""
         good = self.angle >= angle
         good[track[(self.depth <= 0) | ~(self.error <= error)]] = False
         return good
 
 
 def triangulate(views: Views, observations: Observations) -> Triangulated:
-    """Points that minimise the squared reprojection errors: the points nearest to the rays, refined by Gauss-Newton."""
+    """Points that minimise the squared reprojection errors: the points nearest to the rays, refined
+    by Gauss-Newton."""
     camera, track, rays = observations
     starts = np.flatnonzero(np.diff(track, prepend=-1))
     total = lambda values: np.add.reduceat(values, starts, axis=0)
@@ -88,7 +94,8 @@ def triangulate(views: Views, observations: Observations) -> Triangulated:
         local, difference, cost = residual(points)
         inverse = 1 / np.where(local[:, 2] == 0, np.inf, local[:, 2])
         plane = local[:, :2] * inverse[:, None]
-        slope = inverse[:, None, None] * (rotation[:, :2] - plane[:, :, None] * rotation[:, 2:])  # [n, 2, 3]
+        # [n, 2, 3]
+        slope = inverse[:, None, None] * (rotation[:, :2] - plane[:, :, None] * rotation[:, 2:])
         gradient = np.einsum("nki,nk->ni", slope, np.nan_to_num(difference))
         new = points - _solve(total(np.einsum("nki,nkj->nij", slope, slope)), total(gradient))
         points = np.where((residual(new)[2] < cost)[:, None], new, points)
@@ -110,14 +117,19 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def triangulate_robustly(
     views: Views, observations: Observations, angle: float, error: float, min_views: int = 2
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " n"]]:
-    """Points of all tracks, and which observations are good; the point of a track without any is meaningless.
+    """Points of all tracks, and which observations are good; the point of a track without any is
+    meaningless.
 
     Points are triangulated once more without the observations whose errors are too large.
 
-    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees apart."""
+    A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees
+    apart."""
     first = triangulate(views, observations)
     points, keep = first.points, (first.error <= error) & (first.depth > 0)
-    keep &= np.bincount(observations.track[keep], minlength=len(points))[observations.track] >= min_views
+    keep &= (
+        np.bincount(observations.track[keep], minlength=len(points))[observations.track]
+        >= min_views
+    )
     names, rest = observations.numbered(keep)
     second = triangulate(views, rest)
     good = second.good(rest.track, angle, error)

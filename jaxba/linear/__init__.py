@@ -1,1 +1,2 @@
-"""The damped linear system: Schur complement, factorisations, conjugate gradients, preconditioners."""
+"""The damped linear system: Schur complement, factorisations, conjugate gradients,
+preconditioners."""

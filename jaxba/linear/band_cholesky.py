@@ -1,10 +1,12 @@
 """Cholesky factorisation of a banded reduced camera system, tile by tile.
 
-A window of as many tiles as the band is wide slides down the diagonal. Each step factors its first tile, solves for the
-tiles below, subtracts their outer product from the rest of the window, and moves on by one row of tiles. The compiled
-program has one loop body, whatever the length of the sequence.
+A window of as many tiles as the band is wide slides down the diagonal. Each step factors its first
+tile, solves for the tiles below, subtracts their outer product from the rest of the window, and
+moves on by one row of tiles. The compiled program has one loop body, whatever the length of the
+sequence.
 
-Source: Golub and Van Loan, "Matrix Computations", section 4.3 (band Cholesky), blocked as LAPACK's pbtrf."""
+Source: Golub and Van Loan, "Matrix Computations", section 4.3 (band Cholesky), blocked as LAPACK's
+pbtrf."""
 
 from __future__ import annotations
 
@@ -20,11 +22,15 @@ from jaxba.structure.camera_ordering import Band
 from jaxba.structure.segment_sums import take_rows
 
 
-def band_rows(band: Band, blocks: Float[Array, "blocks width width"]) -> Float[Array, "tiles rows columns"]:
+def band_rows(
+    band: Band, blocks: Float[Array, "blocks width width"]
+) -> Float[Array, "tiles rows columns"]:
     """The tiles of every row of tiles; the diagonal one is last. Padding gets a unit diagonal."""
     tiles, m, columns = band.blocks.shape
     width = blocks.shape[-1]
-    rows = take_rows(blocks.reshape(-1, width**2), band.blocks).reshape(tiles, m, columns, width, width)
+    rows = take_rows(blocks.reshape(-1, width**2), band.blocks).reshape(
+        tiles, m, columns, width, width
+    )
     rows = rows.transpose(0, 1, 3, 2, 4).reshape(tiles, width * m, width * columns)
     padding = jnp.repeat(band.camera == band.rank.shape[0], width, axis=1).astype(rows.dtype)
     unit = padding[:, :, None] * jnp.eye(width * m, dtype=rows.dtype)
@@ -36,7 +42,8 @@ class BandFactor(NamedTuple):
 
     band: Band
     inverses: Float[Array, "tiles size size"]  # of the diagonal tiles
-    below: Float[Array, "tiles rest size"]  # the rows of L below each diagonal tile, within the band
+    # the rows of L below each diagonal tile, within the band
+    below: Float[Array, "tiles rest size"]
 
     def solve(self, right: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         """Solves `L L^T x = b`."""
@@ -66,11 +73,16 @@ def band_factor(band: Band, blocks: Float[Array, "blocks width width"]) -> BandF
     """Cholesky factor of S; non-finite if S is not positive definite."""
     rows = band_rows(band, blocks)
     _, size, columns = rows.shape
-    window_tiles, rest = columns // size, columns - size  # tiles in the window, rows below its first tile
+    # tiles in the window, rows below its first tile
+    window_tiles, rest = columns // size, columns - size
     window = jnp.zeros((columns, columns), rows.dtype)
     for k in range(window_tiles):  # row k of the window ends on the diagonal
-        window = window.at[k * size : (k + 1) * size, : (k + 1) * size].set(rows[k, :, columns - (k + 1) * size :])
-    entering = jnp.concatenate([rows[window_tiles:], jnp.zeros((window_tiles, size, columns), rows.dtype)])
+        window = window.at[k * size : (k + 1) * size, : (k + 1) * size].set(
+            rows[k, :, columns - (k + 1) * size :]
+        )
+    entering = jnp.concatenate(
+        [rows[window_tiles:], jnp.zeros((window_tiles, size, columns), rows.dtype)]
+    )
     unit = jnp.eye(size, dtype=rows.dtype)
 
     def eliminate(window: Array, new: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -78,7 +90,9 @@ def band_factor(band: Band, blocks: Float[Array, "blocks width width"]) -> BandF
         inverse = solve_triangular(factor, unit, lower=True)
         below = jnp.matmul(window[size:, :size], inverse.T, precision="highest")
         update = jnp.matmul(below, below.T, precision="highest")
-        shifted = jnp.concatenate([window[size:, size:] - update, jnp.zeros((rest, size), rows.dtype)], axis=1)
+        shifted = jnp.concatenate(
+            [window[size:, size:] - update, jnp.zeros((rest, size), rows.dtype)], axis=1
+        )
         return jnp.concatenate([shifted, new]), (inverse, below)
 
     _, (inverses, below) = lax.scan(eliminate, window, entering)

@@ -1,15 +1,17 @@
 """Shared lenses as a border of the reduced camera system.
 
-Let S be the reduced camera system of camera blocks, and T the matrix that copies the parameters y_L of shared lenses to
-their cameras. In `T^T S T` the shared lenses are the last rows and columns:
+Let S be the reduced camera system of camera blocks, and T the matrix that copies the parameters y_L
+of shared lenses to their cameras. In `T^T S T` the shared lenses are the last rows and columns:
 
     [ A    B ] [ x   ]   [ b_A ]        B = S T_L,   C = T_L^T S T_L,   b_L = T_L^T b
     [ B^T  C ] [ y_L ] = [ b_L ]
 
-A is S without the lenses of cameras that share theirs. It keeps the band or blocks of S, so that it is factored like
-S; then `(C - B^T A^-1 B) y_L = b_L - B^T A^-1 b_A`. The columns `S T_L` are products with S that do not form it.
+A is S without the lenses of cameras that share theirs. It keeps the band or blocks of S, so that it
+is factored like S; then `(C - B^T A^-1 B) y_L = b_L - B^T A^-1 b_A`. The columns `S T_L` are
+products with S that do not form it.
 
-Source: bordered systems as in Golub and Van Loan, "Matrix Computations", section 3.2.11 (block elimination)."""
+Source: bordered systems as in Golub and Van Loan, "Matrix Computations", section 3.2.11 (block
+elimination)."""
 
 from __future__ import annotations
 
@@ -25,25 +27,36 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.unknowns import Unknowns
 
-Solve = Callable[[Array], Array]  # a linear function of arrays [cameras, width] or [cameras, width, columns]
+# a linear function of arrays [cameras, width] or [cameras, width, columns]
+Solve = Callable[[Array], Array]
 
 
 def bordered(
-    unknowns: Unknowns, product: Solve, inner: Solve, like: Float[Array, "cameras width"], *, store: bool
+    unknowns: Unknowns,
+    product: Solve,
+    inner: Solve,
+    like: Float[Array, "cameras width"],
+    *,
+    store: bool,
 ) -> Solve:
-    """`T (T^T S T)^-1 T^T` for shared lenses; non-finite if the system is not positive definite. `product` is that with
-    S, `inner` is `A^-1`, for `without_lenses` of S, and `like` has the shape and type of a right-hand side. `store`:
-    whether `A^-1 B` is stored for several right-hand sides, and not computed along with the only one."""
+    """`T (T^T S T)^-1 T^T` for shared lenses; non-finite if the system is not positive definite.
+    `product` is that with S, `inner` is `A^-1`, for `without_lenses` of S, and `like` has the shape
+    and type of a right-hand side. `store`: whether `A^-1 B` is stored for several right-hand sides,
+    and not computed along with the only one."""
     lenses, numbers = unknowns.lenses, len(unknowns.columns)
     if not lenses.several:
         return inner
     members = jnp.asarray(lenses.members).astype(like.dtype)
-    unit = jnp.eye(numbers, like.shape[1], POSE_SIZE, dtype=like.dtype)  # one column of T_L for one camera
+    # one column of T_L for one camera
+    unit = jnp.eye(numbers, like.shape[1], POSE_SIZE, dtype=like.dtype)
     columns_of = lambda member: jax.vmap(lambda row: product(member[:, None] * row))(unit)
     whole = lax.map(columns_of, members.T)  # [lenses, numbers, cameras, width]
     whole = whole.reshape(-1, *like.shape).transpose(1, 2, 0)
-    corner = jnp.einsum("cl,ckm->lkm", members, whole[:, POSE_SIZE:], precision="highest").reshape(-1, whole.shape[2])
-    absent = jnp.repeat(jnp.asarray(lenses.owners) >= lenses.distinct, numbers)  # room for more shared lenses
+    corner = jnp.einsum("cl,ckm->lkm", members, whole[:, POSE_SIZE:], precision="highest").reshape(
+        -1, whole.shape[2]
+    )
+    # room for more shared lenses
+    absent = jnp.repeat(jnp.asarray(lenses.owners) >= lenses.distinct, numbers)
     corner += jnp.diag(absent.astype(corner.dtype))
 
     def kept(x: Array) -> Array:
@@ -56,7 +69,9 @@ def bordered(
     stored = (inner(columns),) if store else ()
 
     def solve(right: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
-        found = inner(jnp.concatenate([kept(right)[:, :, None], *([] if store else [columns])], axis=2))
+        found = inner(
+            jnp.concatenate([kept(right)[:, :, None], *([] if store else [columns])], axis=2)
+        )
         own, solved = found[:, :, 0], jnp.concatenate([found[:, :, 1:], *stored], axis=2)
         times = lambda x: jnp.einsum("cam,ca...->m...", columns, x, precision="highest")
         sums = lenses.total(right[:, POSE_SIZE:])
@@ -73,7 +88,8 @@ def bordered(
 def without_lenses(
     unknowns: Unknowns, pairs: PairLayout, blocks: Float[Array, "blocks width width"]
 ) -> Float[Array, "blocks kept kept"]:
-    """The blocks of A from those of S: with unit rows for shared lenses, or without lenses if all are shared."""
+    """The blocks of A from those of S: with unit rows for shared lenses, or without lenses if all
+    are shared."""
     if not unknowns.lenses.several:
         return blocks
     if unknowns.all_shared:

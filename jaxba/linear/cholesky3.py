@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-PIVOT_FLOOR = 16.0  # least pivot, in machine epsilons of its diagonal: with parallel rays a step stays finite
+# least pivot, in machine epsilons of its diagonal: with parallel rays a step stays finite
+PIVOT_FLOOR = 16.0
 
 
 class Cholesky3(NamedTuple):

@@ -1,7 +1,8 @@
 """Preconditioned conjugate gradients with Ceres' stopping rule and an iteration count.
 
-`jax.scipy.sparse.linalg.cg` computes the same iterates, but returns no count and stops on the residual norm only. An
-inexact Newton step should stop on the quadratic model instead: late iterations hardly lower it."""
+`jax.scipy.sparse.linalg.cg` computes the same iterates, but returns no count and stops on the
+residual norm only. An inexact Newton step should stop on the quadratic model instead: late
+iterations hardly lower it."""
 
 from __future__ import annotations
 
@@ -34,15 +35,17 @@ def conjugate_gradients(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Array, "..."], Int[Array, ""]]:
-    """Solves `A x = b` from `x = 0` for a symmetric positive definite operator. Returns the iterate and the number of
-    iterations. Negative curvature stops with the last iterate. A non-finite number makes the result non-finite.
+    """Solves `A x = b` from `x = 0` for a symmetric positive definite operator. Returns the iterate
+    and the number of iterations. Negative curvature stops with the last iterate. A non-finite
+    number makes the result non-finite.
 
     Args:
         apply: `A`.
         right: `b`, any shape.
         precondition: `M^-1`, symmetric positive definite.
-        forcing: stop when `i (Q_i - Q_(i-1)) / Q_i < forcing`, where `Q_i = x.A x - 2 b.x = -x.(b + r)` in iteration
-            i. Source: Ceres conjugate_gradients_solver, after Nash and Sofer 1990. Zero switches the test off.
+        forcing: stop when `i (Q_i - Q_(i-1)) / Q_i < forcing`, where `Q_i = x.A x - 2 b.x = -x.(b +
+            r)` in iteration i. Source: Ceres conjugate_gradients_solver, after Nash and Sofer 1990.
+            Zero switches the test off.
         tolerance: stop when `|r| <= tolerance |b|`.
         max_iterations: upper bound."""
     bound = tolerance * tolerance * jnp.sum(right * right)
@@ -69,7 +72,10 @@ def conjugate_gradients(
     scaled = precondition(right)
     product = jnp.sum(right * scaled)
     zero = jnp.zeros_like(right)
-    start = _Carry(zero, right, scaled, product, jnp.zeros_like(product), jnp.zeros((), jnp.int32), product > 0)
+    start = _Carry(
+        zero, right, scaled, product, jnp.zeros_like(product), jnp.zeros((), jnp.int32), product > 0
+    )
     end = loops.while_loop(lambda c: c.running, body, start)
-    # with a non-finite preconditioner or right-hand side the loop does not start: return nan, not a zero step
+    # with a non-finite preconditioner or right-hand side the loop does not start: return nan, not a
+    # zero step
     return jnp.where(jnp.isfinite(product), end.x, jnp.full_like(right, jnp.nan)), end.count

@@ -1,8 +1,9 @@
-"""The reduced camera system `S x = b` by a factorisation: of a band, dense, or of Woodbury's capacitance matrix.
+"""The reduced camera system `S x = b` by a factorisation: of a band, dense, or of Woodbury's
+capacitance matrix.
 
-What cameras share is solved as `T^T S T y = T^T b`, `x = T y` (structure/unknowns.py): by merging rows and columns of S
-where it is one dense matrix or has frames, else with lenses as a border (linear/border.py), so that a band stays one.
-"""
+What cameras share is solved as `T^T S T y = T^T b`, `x = T y` (structure/unknowns.py): by merging
+rows and columns of S where it is one dense matrix or has frames, else with lenses as a border
+(linear/border.py), so that a band stays one."""
 
 from __future__ import annotations
 
@@ -24,17 +25,20 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_rows
 from jaxba.structure.unknowns import Unknowns
 
-FLOAT32_SHIFT = 64.0  # machine epsilons added to the unit diagonal of a scaled float32 system, indefinite by rounding
+# machine epsilons added to the unit diagonal of a scaled float32 system, indefinite by rounding
+FLOAT32_SHIFT = 64.0
 
 
 def in_full(layout: Layout) -> bool:
-    """Whether the system is factored in float64 also if mixed precision is asked for: it is small, or has frames."""
+    """Whether the system is factored in float64 also if mixed precision is asked for: it is small,
+    or has frames."""
     return layout.unknowns.merged or _by_woodbury(layout)
 
 
 def factored(system: DampedSystem, *, rough: bool = False) -> Solve:
-    """`T (T^T S T)^-1 T^T`; non-finite if S is not positive definite. The system is B + D_c and what is eliminated.
-    `rough` is for a preconditioner in float32: the diagonal is scaled to one and shifted, so that the factor exists."""
+    """`T (T^T S T)^-1 T^T`; non-finite if S is not positive definite. The system is B + D_c and
+    what is eliminated. `rough` is for a preconditioner in float32: the diagonal is scaled to one
+    and shifted, so that the factor exists."""
     layout, unknowns = system.layout, system.layout.unknowns
     if _by_woodbury(layout):
         wide = dense_coupling(system)
@@ -64,25 +68,37 @@ def _merged(unknowns: Unknowns, lower: Float[Array, "n n"], rough: bool) -> Solv
     """Of S as one matrix, of which only the lower triangle is read."""
     numbers = unknowns.numbers
     solve = _dense(numbers.merged(lower), rough)
-    return lambda right: numbers.copied(solve(numbers.total(right.reshape(-1)))).reshape(right.shape)
+    return lambda right: numbers.copied(solve(numbers.total(right.reshape(-1)))).reshape(
+        right.shape
+    )
 
 
 def _dense(matrix: Float[Array, "n n"], rough: bool) -> Solve:
     if not rough:
         return lambda x: factor_and_solve(matrix, x)
     scale = lax.rsqrt(jnp.diagonal(matrix))
-    panels = factor_panels(matrix * scale[:, None] * scale + _shift(matrix) * jnp.eye(len(matrix), dtype=matrix.dtype))
+    panels = factor_panels(
+        matrix * scale[:, None] * scale + _shift(matrix) * jnp.eye(len(matrix), dtype=matrix.dtype)
+    )
     times = lambda x: (scale if x.ndim == 1 else scale[:, None]) * x
     return lambda x: times(panels.solve(times(x)))
 
 
-def _banded(pairs: PairLayout, band: Band, blocks: Float[Array, "blocks width width"], rough: bool) -> Solve:
+def _banded(
+    pairs: PairLayout, band: Band, blocks: Float[Array, "blocks width width"], rough: bool
+) -> Solve:
     if rough:
-        diagonal = jnp.diagonal(take_rows(blocks, pairs.diagonal), axis1=1, axis2=2)  # [cameras, width]
+        # [cameras, width]
+        diagonal = jnp.diagonal(take_rows(blocks, pairs.diagonal), axis1=1, axis2=2)
         scale = lax.rsqrt(diagonal)
-        sides = take_rows(scale, pairs.block_row)[:, :, None], take_rows(scale, pairs.block_column)[:, None, :]
+        sides = (
+            take_rows(scale, pairs.block_row)[:, :, None],
+            take_rows(scale, pairs.block_column)[:, None, :],
+        )
         own = (pairs.block_camera < len(scale)).astype(blocks.dtype)[:, None, None]
-        blocks = blocks * sides[0] * sides[1] + _shift(blocks) * own * jnp.eye(blocks.shape[-1], dtype=blocks.dtype)
+        blocks = blocks * sides[0] * sides[1] + _shift(blocks) * own * jnp.eye(
+            blocks.shape[-1], dtype=blocks.dtype
+        )
         factor = band_factor(band, blocks)
         one = lambda x: scale * factor.solve(scale * x)
     else:

@@ -33,7 +33,8 @@ def reduced_blocks(system: DampedSystem) -> Float[Array, "blocks width width"]:
 def apply_blocks(
     layout: Layout, blocks: Float[Array, "blocks width width"], x: Float[Array, "cameras width"]
 ) -> Float[Array, "cameras width"]:
-    """`S x` with S in blocks of the lower triangle; each block is read once, for itself and for its transpose."""
+    """`S x` with S in blocks of the lower triangle; each block is read once, for itself and for its
+    transpose."""
     pairs = layout.part("pairs")
     rows = jnp.einsum("nab,nb->na", blocks, take_rows(x, pairs.block_column))
     columns = jnp.einsum("nab,na->nb", blocks, take_rows(x, pairs.block_row))
@@ -41,7 +42,8 @@ def apply_blocks(
 
 
 def dense_coupling(system: DampedSystem) -> Float[Array, "unknowns columns"]:
-    """`W = E L^-T`, so that `S = B + D_c - W W^T`: one row per camera unknown, one column per coordinate of a point."""
+    """`W = E L^-T`, so that `S = B + D_c - W W^T`: one row per camera unknown, one column per
+    coordinate of a point."""
     grid = system.layout.part("grid")
     count, cameras = grid.shape
     rows = take_rows(coupling_rows(system), grid).reshape(count, cameras, 3, -1)
@@ -60,8 +62,9 @@ def dense_system(system: DampedSystem) -> Float[Array, "unknowns unknowns"]:
 def pair_products(
     pairs: PairLayout, rows: Float[Array, "items three_width"], width: int
 ) -> Float[Array, "blocks square"]:
-    """`sum Y_left Y_right^T` for every block of the lower triangle; the last block is zero. `pairs` says which rows are
-    multiplied into which block, `rows` are `Y^T` [3, width] of every observation, flattened."""
+    """`sum Y_left Y_right^T` for every block of the lower triangle; the last block is zero. `pairs`
+    says which rows are multiplied into which block, `rows` are `Y^T` [3, width] of every
+    observation, flattened."""
 
     def batch(parts: tuple[Array, Array, Array]) -> Array:
         *sides, sums = parts
@@ -70,14 +73,22 @@ def pair_products(
         return tree_sum(products, (sums,))
 
     # batch by batch, so that the gathered rows and their products stay in the cache
-    partial = loops.map_rows(batch, (pairs.left, pairs.right, pairs.sums), pairs.used).reshape(-1, width * width)
+    partial = loops.map_rows(batch, (pairs.left, pairs.right, pairs.sums), pairs.used).reshape(
+        -1, width * width
+    )
     if pairs.used is None:
-        return compute_unfused(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
+        return compute_unfused(
+            lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums
+        )
     zeros = jnp.zeros((pairs.levels[0].shape[1], width * width), partial.dtype)
-    return compute_unfused(lambda partial: prefix_sum(zeros, partial, pairs.levels, 0), partial, index=pairs.sums)
+    return compute_unfused(
+        lambda partial: prefix_sum(zeros, partial, pairs.levels, 0), partial, index=pairs.sums
+    )
 
 
-def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks width width"]) -> Float[Array, "n n"]:
+def dense_blocks(
+    pairs: PairLayout, blocks: Float[Array, "blocks width width"]
+) -> Float[Array, "n n"]:
     """The blocks assembled into one matrix, of which only the lower triangle is filled."""
     assert pairs.table is not None
     side, width = pairs.table.shape[0], blocks.shape[-1]

@@ -48,7 +48,8 @@ def preconditioner(
 def _with_shared(
     unknowns: Unknowns, blocks: Float[Array, "cameras width width"]
 ) -> Float[Array, "cameras width width"]:
-    """The blocks, with means over cameras in the place of a shared lens or the pose of a frame, which do not couple."""
+    """The blocks, with means over cameras in the place of a shared lens or the pose of a frame,
+    which do not couple."""
     if not unknowns.shared:
         return blocks
     pose = unknowns.poses.mean(blocks[:, :POSE_SIZE, :POSE_SIZE])
@@ -63,9 +64,10 @@ def _with_shared(
 def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]:
     """The diagonal blocks of S, `D_c + sum J_c^T (I - Q Q^T) J_c`.
 
-    With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
-    observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the
-    two observations is missing, which is harmless in a preconditioner."""
+    With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T
+    J_c`, two an observation, which stays positive semi-definite under rounding. If a camera sees a
+    point twice, the product of the two observations is missing, which is harmless in a
+    preconditioner."""
     layout, (over, under) = system.layout, system.points.projected
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     f00 = safe_sqrt(jnp.maximum(1 - dot(over, over), 0))
@@ -73,14 +75,19 @@ def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]
     f11 = safe_sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))
     f00, f10, f11 = fusion_barrier(jnp.stack([f00, f10, f11]))
     first, second = system.linear.camera_jacobian
-    columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
+    columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [
+        f11 * b for b in second
+    ]
     level, *levels = layout.camera_levels
     gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, len(first))
-    return system.cameras.own + sum_over_devices(layout, tree_sum(outer_sum(gathered, gathered), tuple(levels)))
+    return system.cameras.own + sum_over_devices(
+        layout, tree_sum(outer_sum(gathered, gathered), tuple(levels))
+    )
 
 
 def block_inverse(blocks: Float[Array, "cameras width width"]) -> Callable[[Array], Array]:
-    """The product with the inverses of positive definite blocks, which are formed once by Cholesky."""
+    """The product with the inverses of positive definite blocks, which are formed once by
+    Cholesky."""
     factor = lower_cholesky(blocks)
     eye = jnp.broadcast_to(jnp.eye(blocks.shape[-1], dtype=blocks.dtype), blocks.shape)
     root = solve_triangular(factor, eye, lower=True)

@@ -2,9 +2,10 @@
 
 - `explicit`: form S and factor it by Cholesky, as a band if it is one, else dense.
 - `sparse`: form the non-zero blocks of S, then conjugate gradients with them.
-- `implicit`: conjugate gradients without forming S; a product takes two passes over the observations.
-- `cg`: the same, but `jax.scipy.sparse.linalg.cg` with a fixed number of iterations. Its derivatives are those of the
-  solution, and reverse mode passes through it.
+- `implicit`: conjugate gradients without forming S; a product takes two passes over the
+  observations.
+- `cg`: the same, but `jax.scipy.sparse.linalg.cg` with a fixed number of iterations. Its
+  derivatives are those of the solution, and reverse mode passes through it.
 
 Source: Agarwal et al. 2010, "Bundle Adjustment in the Large"."""
 
@@ -25,18 +26,25 @@ from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import DampedSystem, apply_reduced
 from jaxba.problem.options import StepOptions
 
-_IN_SINGLE = ("linear", "points", "cameras", "parameters")  # what of a system is float32 in mixed precision
-CORRECTION_FORCING = 1e-3  # forcing term of the float64 conjugate gradients around a float32 factorisation
+# what of a system is float32 in mixed precision
+_IN_SINGLE = ("linear", "points", "cameras", "parameters")
+# forcing term of the float64 conjugate gradients around a float32 factorisation
+CORRECTION_FORCING = 1e-3
 
 
-def solve_reduced(system: DampedSystem, options: StepOptions) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
-    """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the options name. Returns the
-    step and the number of iterations (0 for a factorisation). The step is non-finite if a factorisation failed."""
+def solve_reduced(
+    system: DampedSystem, options: StepOptions
+) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
+    """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the
+    options name. Returns the step and the number of iterations (0 for a factorisation). The step is
+    non-finite if a factorisation failed."""
     right, mixed = system.cameras.right, options.mixed_precision
     single = system
     if mixed:
         parts = {name: getattr(system, name) for name in _IN_SINGLE}
-        single = system._replace(**jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), parts))
+        single = system._replace(
+            **jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), parts)
+        )
     if options.linear_solver != "explicit":
         blocks, apply = None, lambda x: apply_reduced(single, x)
         if options.linear_solver == "sparse":
@@ -50,15 +58,24 @@ def solve_reduced(system: DampedSystem, options: StepOptions) -> tuple[Float[Arr
     solve = factored(single, rough=True)
     precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
     corrected = system._replace(forcing=CORRECTION_FORCING)
-    return _conjugate_gradients(corrected, lambda x: apply_reduced(system, x), precondition, options)
+    return _conjugate_gradients(
+        corrected, lambda x: apply_reduced(system, x), precondition, options
+    )
 
 
 def _conjugate_gradients(
-    system: DampedSystem, product: Callable[[Array], Array], inverse: Callable[[Array], Array], options: StepOptions
+    system: DampedSystem,
+    product: Callable[[Array], Array],
+    inverse: Callable[[Array], Array],
+    options: StepOptions,
 ) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     """On the range of T (structure/unknowns.py)."""
     project, rule = system.layout.unknowns.project, options.conjugate_gradients
-    apply, precondition, right = lambda x: project(product(x)), lambda r: project(inverse(r)), system.cameras.right
+    apply, precondition, right = (
+        lambda x: project(product(x)),
+        lambda r: project(inverse(r)),
+        system.cameras.right,
+    )
     if options.linear_solver == "cg":
         # it returns no count; below the rounding error its iterations would end as 0 / 0
         least = float(jnp.finfo(right.dtype).eps)

@@ -1,25 +1,25 @@
 """The Schur complement: points eliminated from the damped normal equations.
 
-With the damped Hessian in blocks of cameras and points, `[[B + D_c, E], [E^T, C + D_p]]`, eliminating the points gives
-the reduced camera system
+With the damped Hessian in blocks of cameras and points, `[[B + D_c, E], [E^T, C + D_p]]`,
+eliminating the points gives the reduced camera system
 
     S d_c = b,    S = B + D_c - E (C + D_p)^-1 E^T,    b = -g_c + E (C + D_p)^-1 g_p,
 
 and the points follow by back-substitution, `d_p = -(C + D_p)^-1 (g_p + E^T d_c)`.
 
-C is block-diagonal, so everything is computed from 3 x 3 factors `C + D_p = L L^T`, one a point. Per observation, with
-Jacobians `J_c` [2, width] and `J_p` [2, 3]:
+C is block-diagonal, so everything is computed from 3 x 3 factors `C + D_p = L L^T`, one a point.
+Per observation, with Jacobians `J_c` [2, width] and `J_p` [2, 3]:
 
     Q = J_p L^-T,   Y = J_c^T Q,   h = L^-1 g_p
     S = B + D_c - sum Y Y^T,   b = -sum J_c^T (r - Q h),   d_p = -L^-T (h + sum Y^T d_c)
 
 The projected residual `r - Q h` in b avoids the cancellation between its two terms.
 
-Rotations are perturbed on the manifold, `R <- exp(d) R`; damping is diagonal in the coordinates of the options
-(`rotation_coordinates`).
+Rotations are perturbed on the manifold, `R <- exp(d) R`; damping is diagonal in the coordinates of
+the options (`rotation_coordinates`).
 
-Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 6; Agarwal et al. 2010, "Bundle Adjustment
-in the Large", section 3."""
+Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 6; Agarwal et al.
+2010, "Bundle Adjustment in the Large", section 3."""
 
 from __future__ import annotations
 
@@ -38,14 +38,26 @@ from jaxba.rotations import left_jacobian, left_jacobian_inverse
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.devices import kept, max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
+from jaxba.structure.segment_sums import (
+    as_rows,
+    outer_sum,
+    point_sums,
+    take,
+    take_each,
+    take_rows,
+    tree_sum,
+)
 
 RotationCoordinates = tuple[Float[Array, "cameras 3 3"], Float[Array, "cameras 3 3"]]
-"""Maps of rotation steps, to first order: from coordinates in which damping is diagonal to the manifold, and back."""
+"""Maps of rotation steps, to first order: from coordinates in which damping is diagonal to the
+manifold, and back."""
 
 
-def rotation_coordinates(cameras: Float[Array, "parameters cameras"], options: StepOptions) -> RotationCoordinates:
-    """The left Jacobian of SO(3) and its inverse for angle-axis coordinates, the identity for manifold coordinates."""
+def rotation_coordinates(
+    cameras: Float[Array, "parameters cameras"], options: StepOptions
+) -> RotationCoordinates:
+    """The left Jacobian of SO(3) and its inverse for angle-axis coordinates, the identity for
+    manifold coordinates."""
     if options.coordinates.rotation == "manifold":
         one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
         return one, one
@@ -64,7 +76,8 @@ class PointSystem(NamedTuple):
 
 
 class CameraSystem(NamedTuple):
-    """The reduced camera system without the sum of `Y Y^T`, which each solver forms or applies in its own way."""
+    """The reduced camera system without the sum of `Y Y^T`, which each solver forms or applies in
+    its own way."""
 
     blocks: Float[Array, "cameras width width"]  # B + D_c, manifold coordinates
     own: Float[Array, "cameras width width"]  # the part of it that is no sum over observations: D_c
@@ -120,7 +133,9 @@ def eliminate_points(
         factor = cholesky3(matrix)
         return [*factor, *factor.forward(gradient), *diagonal]
 
-    entries = kept(layout, compute_in_one_loop(factored, sums, jnp.broadcast_to(damping, sums[0].shape)))
+    entries = kept(
+        layout, compute_in_one_loop(factored, sums, jnp.broadcast_to(damping, sums[0].shape))
+    )
     factor, solved, diagonal = Cholesky3(*entries[:6]), entries[6:9], entries[9:]
     at_slot = take(jnp.stack(factor), layout.slot_point)
 
@@ -141,7 +156,8 @@ def camera_system(
 ) -> CameraSystem:
     """B + D_c, g_c and b of every camera.
 
-    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b: one pass for all."""
+    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b: one pass
+    for all."""
     solved = take(jnp.stack(points.solved), layout.slot_point)
     rows = []
     for k in range(2):
@@ -150,13 +166,22 @@ def camera_system(
     level, *levels = layout.camera_levels
     width, (forward, inverse) = len(linear.camera_jacobian[0]), coordinates
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
-    products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
-    blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
+    products = sum_over_devices(
+        layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
+    )
+    blocks, gradient, right = (
+        products[:, :, :width],
+        products[:, :, width],
+        -products[:, :, width + 1],
+    )
     rotation = jnp.einsum("cji,cjk,ckl->cil", forward, blocks[:, :3, :3], forward)
     diagonal = jnp.concatenate(
-        [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
+        [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]],
+        axis=1,
     )
-    extra = layout.unknowns.shares(damping_diagonal(layout.unknowns.sums(diagonal), damping, options))
+    extra = layout.unknowns.shares(
+        damping_diagonal(layout.unknowns.sums(diagonal), damping, options)
+    )
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     on_manifold = jnp.einsum("cji,cj,cjk->cik", inverse, extra[:, :3], inverse)
@@ -168,15 +193,23 @@ def camera_system(
 def back_substitute(system: DampedSystem, step: Float[Array, "cameras width"]) -> list[Array]:
     """Point step `-L^-T (h + sum Y^T d_c)` of a camera step on the manifold, [3] of (points,)."""
     points, inner = system.points, project_to_points(system, step)
-    return [-x for x in points.factor.backward([h + w for h, w in zip(points.solved, inner, strict=True)])]
+    return [
+        -x
+        for x in points.factor.backward([h + w for h, w in zip(points.solved, inner, strict=True)])
+    ]
 
 
-def apply_reduced(system: DampedSystem, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
-    """`S x = (B + D_c) x - sum Y (Y^T x)` without forming S, in two passes over the observations."""
+def apply_reduced(
+    system: DampedSystem, x: Float[Array, "cameras width"]
+) -> Float[Array, "cameras width"]:
+    """`S x = (B + D_c) x - sum Y (Y^T x)` without forming S, in two passes over the
+    observations."""
     layout, linear, points = system[:3]
     at_slot = take(jnp.stack(project_to_points(system, x)), layout.slot_point)
 
-    def lifted(at_slot: Array, projected: list[list[Array]], first: list[Array], second: list[Array]) -> list[Array]:
+    def lifted(
+        at_slot: Array, projected: list[list[Array]], first: list[Array], second: list[Array]
+    ) -> list[Array]:
         over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
         return [a * over + b * under for a, b in zip(first, second, strict=True)]
 
@@ -188,7 +221,8 @@ def apply_reduced(system: DampedSystem, x: Float[Array, "cameras width"]) -> Flo
 def lift_to_cameras(
     layout: Layout, linear: Linearization, projected: list[list[Array]], solved: list[Array] | Array
 ) -> Float[Array, "cameras width"]:
-    """`E (C + D_p)^-1 g_p = sum Y h` of every camera, for the solved gradients h of the points at their slots."""
+    """`E (C + D_p)^-1 g_p = sum Y h` of every camera, for the solved gradients h of the points at
+    their slots."""
     over, under = (sum(row[i] * solved[i] for i in range(3)) for row in projected)
     rows = as_rows([a * over + b * under for a, b in zip(*linear.camera_jacobian, strict=True)])
     return sum_over_devices(layout, tree_sum(rows, layout.camera_levels))
@@ -199,7 +233,9 @@ def coupling_by_camera(system: DampedSystem) -> Float[Array, "sorted three_width
     layout, _, points, cameras = system[:4]
     assert cameras.rows is not None
     over, under = points.projected
-    projected = take_rows(as_rows([*over, *under]), layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
+    projected = take_rows(as_rows([*over, *under]), layout.camera_levels[0].reshape(-1)).reshape(
+        -1, 2, 3
+    )
     width = cameras.blocks.shape[-1]
     rows = cameras.rows[..., :width].reshape(-1, 2, width)
     return outer_sum(projected, rows).reshape(-1, 3 * width)
@@ -209,7 +245,9 @@ def coupling_rows(system: DampedSystem) -> Float[Array, "slots three_width"]:
     """`Y^T` [3, width] of every slot, flattened."""
     first, second = system.linear.camera_jacobian
     over, under = system.points.projected
-    columns = [a * over[i] + b * under[i] for i in range(3) for a, b in zip(first, second, strict=True)]
+    columns = [
+        a * over[i] + b * under[i] for i in range(3) for a, b in zip(first, second, strict=True)
+    ]
     return as_rows(columns)
 
 
@@ -217,19 +255,29 @@ def project_to_points(system: DampedSystem, x: Float[Array, "cameras width"]) ->
     """`sum Y^T x` over each point's observations, [3] of (points,)."""
     at_slot = take(x.T, system.layout.slot_camera)
 
-    def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
+    def inner(
+        at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]
+    ) -> list[Array]:
         over, under = (sum(a * x for a, x in zip(row, at_slot, strict=True)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
-    terms = compute_in_one_loop(inner, at_slot, system.points.projected, system.linear.camera_jacobian)
+    terms = compute_in_one_loop(
+        inner, at_slot, system.points.projected, system.linear.camera_jacobian
+    )
     return point_sums(system.layout, terms)
 
 
 def jacobian_product(
-    layout: Layout, linear: Linearization, cameras: Float[Array, "cameras width"], points: Float[Array, "3 points"]
+    layout: Layout,
+    linear: Linearization,
+    cameras: Float[Array, "cameras width"],
+    points: Float[Array, "3 points"],
 ) -> list[Array]:
     """`J d` of every slot for a step on the manifold, [2] of (slots,), pixels."""
-    by_camera, by_point = take_each(cameras.T, layout.slot_camera), take_each(points, layout.slot_point)
+    by_camera, by_point = (
+        take_each(cameras.T, layout.slot_camera),
+        take_each(points, layout.slot_point),
+    )
     rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
     dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
     return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]

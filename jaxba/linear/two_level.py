@@ -2,18 +2,21 @@
 
     M^-1 = D^-1 + P (P^T S P)^-1 P^T,    D = the block diagonal of S.
 
-Conjugate gradients are slow on long sequences because of smooth deformations with small eigenvalues: neighbouring
-cameras and their points move together, and residuals hardly change. P spans such motions with seven columns per cluster
-for a similarity (rotation a, translation b, scale s), and one for a common change of each number of the lenses. All
-clusters that share a lens have the columns of its numbers in common, and those with cameras of one frame their motion:
-P is in the range of T (structure/unknowns.py).
+Conjugate gradients are slow on long sequences because of smooth deformations with small
+eigenvalues: neighbouring cameras and their points move together, and residuals hardly change. P
+spans such motions with seven columns per cluster for a similarity (rotation a, translation b, scale
+s), and one for a common change of each number of the lenses. All clusters that share a lens have
+the columns of its numbers in common, and those with cameras of one frame their motion: P is in the
+range of T (structure/unknowns.py).
 
-A similarity of cameras and points together changes no pixel, so that `J_c P = -J_p [a x X, b, s X]`: the columns of
-`S P` follow from the point Jacobians. Where poses are constant, frames have offsets or there are other residuals, this
-does not hold, and they are computed from the camera Jacobians.
+A similarity of cameras and points together changes no pixel, so that `J_c P = -J_p [a x X, b, s
+X]`: the columns of `S P` follow from the point Jacobians. Where poses are constant, frames have
+offsets or there are other residuals, this does not hold, and they are computed from the camera
+Jacobians.
 
-Source: additive two-level Schwarz with a Nicolaides coarse space (Toselli and Widlund 2005, section 3); Jian, Balcan
-and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with subgraphs and clusters instead."""
+Source: additive two-level Schwarz with a Nicolaides coarse space (Toselli and Widlund 2005, section
+3); Jian, Balcan and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with
+subgraphs and clusters instead."""
 
 from __future__ import annotations
 
@@ -36,23 +39,28 @@ from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 from jaxba.structure.sharing import Sharing
 
 SIMILARITY = 7  # columns of a similarity; those of the numbers of lenses follow
-SHIFT = 64.0  # machine epsilons per unknown added to the diagonal, singular for clusters of one camera
-COARSE_PANEL = 256  # columns of a panel of the coarse factor: with 1280 unknowns as fast as 128, compiled sooner
+# machine epsilons per unknown added to the diagonal, singular for clusters of one camera
+SHIFT = 64.0
+# columns of a panel of the coarse factor: with 1280 unknowns as fast as 128, compiled sooner
+COARSE_PANEL = 256
 
 
 def camera_modes(
     layout: Layout, cameras: Float[Array, "parameters cameras"], width: int
 ) -> Float[Array, "cameras width modes"]:
-    """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for unseen cameras.
+    """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for
+    unseen cameras.
 
-    For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all projections is
-    `-R a` for the rotation and `-R b + s t` for the translation."""
+    For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all
+    projections is `-R a` for the rotation and `-R b + s t` for the translation."""
     minus_rotation = -jnp.moveaxis(rotation_matrix(cameras[:3]), -1, 0)
     count = minus_rotation.shape[0]
     numbers = width - POSE_SIZE
     zeros = lambda *shape: jnp.zeros((count, *shape), minus_rotation.dtype)
     rotation = jnp.concatenate([minus_rotation, zeros(3, 4 + numbers)], axis=2)
-    translation = jnp.concatenate([zeros(3, 3), minus_rotation, cameras[3:6].T[:, :, None], zeros(3, numbers)], axis=2)
+    translation = jnp.concatenate(
+        [zeros(3, 3), minus_rotation, cameras[3:6].T[:, :, None], zeros(3, numbers)], axis=2
+    )
     lens = jnp.eye(numbers, SIMILARITY + numbers, SIMILARITY, dtype=minus_rotation.dtype)
     lens = jnp.broadcast_to(lens, (count, *lens.shape))
     modes = jnp.concatenate([rotation, translation, lens], axis=1)
@@ -72,7 +80,8 @@ def coarse_preconditioner(system: DampedSystem) -> Callable[[Array], Array]:
     shift = jnp.where(diagonal > 0, SHIFT * unknowns * float(jnp.finfo(matrix.dtype).eps), 1.0)
     scaled = matrix * scale[:, None] * scale + jnp.diag(shift)
     panels = factor_panels(scaled, COARSE_PANEL)
-    valid = jnp.isfinite(panels.inverses[-1]).all()  # a failed panel makes all later ones non-finite
+    # a failed panel makes all later ones non-finite
+    valid = jnp.isfinite(panels.inverses[-1]).all()
 
     def apply(r: Array) -> Array:
         inner = cluster_sum(clusters, jnp.einsum("cam,ca->cm", modes, r))
@@ -86,7 +95,8 @@ def coarse_preconditioner(system: DampedSystem) -> Callable[[Array], Array]:
 def coarse_system(
     system: DampedSystem, modes: Float[Array, "cameras width modes"]
 ) -> Float[Array, "unknowns unknowns"]:
-    """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
+    """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of
+    clusters."""
     clusters, count = system.layout.part("clusters"), modes.shape[-1]
     layout, unknowns = system.layout, system.layout.unknowns
     # whether a similarity of cameras and points changes no residual, cluster by cluster
@@ -100,16 +110,23 @@ def coarse_system(
     return dense_blocks(clusters.pairs, blocks.reshape(-1, count, count))
 
 
-def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Float[Array, "clusters k"]:
+def cluster_sum(
+    clusters: ClusterLayout, rows: Float[Array, "cameras k"]
+) -> Float[Array, "clusters k"]:
     """The sum of the rows of each cluster's cameras."""
     padded = jnp.concatenate([rows, jnp.zeros((1, rows.shape[1]), rows.dtype)])
     return jnp.sum(take_rows(padded, clusters.members), axis=1)
 
 
-def _coupling_rows(system: DampedSystem, modes: Float[Array, "cameras width modes"]) -> Float[Array, "coarse rows"]:
-    """`P^T Y`, transposed and flattened, summed over the observations of each point by each cluster."""
+def _coupling_rows(
+    system: DampedSystem, modes: Float[Array, "cameras width modes"]
+) -> Float[Array, "coarse rows"]:
+    """`P^T Y`, transposed and flattened, summed over the observations of each point by each
+    cluster."""
     motions = modes[:, :POSE_SIZE, :SIMILARITY]
-    at_slot = take_rows(motions.reshape(len(motions), -1), system.layout.slot_camera).reshape(-1, *motions.shape[1:])
+    at_slot = take_rows(motions.reshape(len(motions), -1), system.layout.slot_camera).reshape(
+        -1, *motions.shape[1:]
+    )
     coupling = coupling_rows(system).reshape(-1, 3, modes.shape[1])
     moved = jnp.einsum("nia,nam->nim", coupling[:, :, :POSE_SIZE], at_slot)
     rows = jnp.concatenate([moved, coupling[:, :, POSE_SIZE:]], axis=2)
@@ -117,8 +134,8 @@ def _coupling_rows(system: DampedSystem, modes: Float[Array, "cameras width mode
 
 
 def _similar_rows(system: DampedSystem) -> Float[Array, "coarse rows"]:
-    """The same where modes change no residual, `J_c P = -J_p [a x X, b, s X]`. The observations have the point X in
-    common, so that only `J_p^T Q` and the columns of the lenses are summed."""
+    """The same where modes change no residual, `J_c P = -J_p [a x X, b, s X]`. The observations
+    have the point X in common, so that only `J_p^T Q` and the columns of the lenses are summed."""
     clusters, linear = system.layout.part("clusters"), system.linear
     over, under = system.points.projected
     (first, second), (high, low) = linear.point_jacobian, linear.camera_jacobian
@@ -126,10 +143,21 @@ def _similar_rows(system: DampedSystem) -> Float[Array, "coarse rows"]:
     numbers = range(POSE_SIZE, len(high))
     lens = [[high[k] * over[i] + low[k] * under[i] for k in numbers] for i in range(3)]
     columns = [column for i in range(3) for column in moved[i] + lens[i]]
-    sums = compute_unfused(lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point).T
+    sums = compute_unfused(
+        lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point
+    ).T
     x, y, z = take_each(system.parameters[1], clusters.point)
     rows = []
     for i in range(3):
         p, q, r, *own = sums.reshape(3, -1, sums.shape[-1])[i]
-        rows += [q * z - r * y, r * x - p * z, p * y - q * x, -p, -q, -r, -(p * x + q * y + r * z), *own]
+        rows += [
+            q * z - r * y,
+            r * x - p * z,
+            p * y - q * x,
+            -p,
+            -q,
+            -r,
+            -(p * x + q * y + r * z),
+            *own,
+        ]
     return as_rows(rows)

@@ -1,7 +1,9 @@
-"""The interface of methods, each a way to compute the step of an iteration, and plain Levenberg-Marquardt.
+"""The interface of methods, each a way to compute the step of an iteration, and plain
+Levenberg-Marquardt.
 
-`lm_step` calls `StepMethod.solve`. A method is a frozen dataclass, so that it can be a field of the static
-`StepOptions`; its other properties are attributes of the class. `solver/methods.py` finds methods by name."""
+`lm_step` calls `StepMethod.solve`. A method is a frozen dataclass, so that it can be a field of the
+static `StepOptions`; its other properties are attributes of the class. `solver/methods.py` finds
+methods by name."""
 
 from __future__ import annotations
 
@@ -33,12 +35,14 @@ class StepMethod(MethodTraits, ABC):
     """Name of the damping rule that the method was published with."""
 
     def options(self, base: StepOptions) -> StepOptions:
-        """Step options for this method, which keep everything of `base` that the method does not decide."""
+        """Step options for this method, which keep everything of `base` that the method does not
+        decide."""
         return replace(base, method=self)
 
     @abstractmethod
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
-        """The camera step of the damped system, and the point step if the method has it; the options are static."""
+        """The camera step of the damped system, and the point step if the method has it; the
+        options are static."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +70,15 @@ def method_of(options: StepOptions) -> StepMethod:
 
 
 def check_plain(options: StepOptions, error: type[ValueError] = ValueError, **asked: bool) -> None:
-    """Refuses what only plain LM has, by an error of this kind; `asked` says which keys of `PLAIN_ONLY` there are."""
+    """Refuses what only plain LM has, by an error of this kind; `asked` says which keys of
+    `PLAIN_ONLY` there are."""
     for what, wanted in asked.items():
         if wanted and options.method:
             raise error(PLAIN_ONLY[what].format(options.solver_name))
 
 
-PLAIN_ONLY = {  # what only plain LM has, with the message of its refusal for the name of another method
+# what only plain LM has, with the message of its refusal for the name of another method
+PLAIN_ONLY = {
     "rigs": "rigs need plain LM, not {}",
     "shared_lenses": "shared lenses need plain LM, not {}",
     "residuals": "priors and residuals of your own need plain LM, not {}",

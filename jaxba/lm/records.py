@@ -28,7 +28,8 @@ class LMState(NamedTuple):
 class StepInfo(NamedTuple):
     """Record of one iteration. A damping policy sees this and nothing else of the solve.
 
-    That of all iterations of a solve has an array for each field, with an entry for each iteration."""
+    That of all iterations of a solve has an array for each field, with an entry for each
+    iteration."""
 
     cost: Float[Array, ""]
     """Accepted cost after the iteration, pixels^2."""
@@ -81,12 +82,19 @@ class StepInfo(NamedTuple):
     @classmethod
     def stacked(cls, steps: Sequence[StepInfo]) -> StepInfo:
         """The records of several iterations as one, of NumPy arrays."""
-        column = lambda name: np.array([getattr(step, name) for step in steps], KINDS.get(name, float))
+        column = lambda name: np.array(
+            [getattr(step, name) for step in steps], KINDS.get(name, float)
+        )
         columns: dict[str, Any] = {name: column(name) for name in cls._fields}
         return cls(**columns)
 
     __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
 
 
-KINDS: dict[str, Any] = {"accepted": bool, "weightless": bool, "cg_iterations": np.int32, "repairs": np.int32}
+KINDS: dict[str, Any] = {
+    "accepted": bool,
+    "weightless": bool,
+    "cg_iterations": np.int32,
+    "repairs": np.int32,
+}
 """Types of the fields of a record that are no floating point numbers."""

@@ -6,12 +6,14 @@ From the parameters x with cost f(x):
     try_step   rho = (f(x) - f(x + d)) / (m(0) - m(d))
                x <- x + d  if  f(x + d) < f(x)  and  rho > min_gain,  else x stays
 
-where m is the linear model and rho the gain ratio. With the options of `Refinement`, `try_step` also improves x + d
-without another linear solve (refinement/candidates.py). A damping policy chooses lambda between iterations.
+where m is the linear model and rho the gain ratio. With the options of `Refinement`, `try_step`
+also improves x + d without another linear solve (refinement/candidates.py). A damping policy
+chooses lambda between iterations.
 
-`lm_step` is a pure function: it compiles once per problem shape and `StepOptions` and runs under `vmap`. It never
-branches in Python on a computed value: a failed factorisation or an overflow gives a candidate with a non-finite cost,
-which is rejected like any other bad step."""
+`lm_step` is a pure function: it compiles once per problem shape and `StepOptions` and runs under
+`vmap`. It never
+branches in Python on a computed value: a failed factorisation or an overflow gives a candidate with
+a non-finite cost, which is rejected like any other bad step."""
 
 from __future__ import annotations
 
@@ -47,13 +49,17 @@ class Proposal(NamedTuple):
 
 
 @for_traces
-def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
-    """The parameters of a problem, the start of the optimisation, in the order of a layout that was made from it, with
-    their cost, for the loss and the method of the options. `dtype` is the floating point type of the solve; that of the
-    problem's arrays if None."""
+def initial_state(
+    layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None
+) -> LMState:
+    """The parameters of a problem, the start of the optimisation, in the order of a layout that was
+    made from it, with their cost, for the loss and the method of the options. `dtype` is the
+    floating point type of the solve; that of the problem's arrays if None."""
     check_x64(problem.cameras.dtype if dtype is None else dtype)
     if layout.unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + layout.unknowns.size:
-        raise ValueError("a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it")
+        raise ValueError(
+            "a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it"
+        )
     return state_of(layout, problem.cameras, problem.points, options, dtype)
 
 
@@ -80,13 +86,15 @@ def lm_step(
     min_gain: float | Float[Array, ""] = 0.0,
     iteration: int | Int[Array, ""] = 0,
 ) -> tuple[LMState, StepInfo]:
-    """One iteration: one linear solve with the given lambda, accepted or rejected. Returns the next state (unchanged
-    after a rejection) and the record of the iteration. Raises ValueError: the method does not support the problem
-    (`lm.method.PLAIN_ONLY`); or the state is float64, and 64 bits are not enabled in JAX.
+    """One iteration: one linear solve with the given lambda, accepted or rejected. Returns the next
+    state (unchanged after a rejection) and the record of the iteration. Raises ValueError: the
+    method does not support the problem (`lm.method.PLAIN_ONLY`); or the state is float64, and 64
+    bits are not enabled in JAX.
 
-    Without refinement it is differentiable by cameras, points, observations and lambda (the accept decision is a
-    constant): forwards with every linear solver; backwards with a factorisation in full precision and a layout without
-    padding, but not through loops that end when they are done, as conjugate gradients do.
+    Without refinement it is differentiable by cameras, points, observations and lambda (the accept
+    decision is a constant): forwards with every linear solver; backwards with a factorisation in
+    full precision and a layout without padding, but not through loops that end when they are done,
+    as conjugate gradients do.
 
     Args:
         layout: the problem's observations.
@@ -94,21 +102,29 @@ def lm_step(
         damping: lambda; `Coordinates.scaling` says what it multiplies.
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
-        iteration: number of the iteration, from 0; methods with random clusters use other ones in each."""
+        iteration: number of the iteration, from 0; methods with random clusters use other ones in
+            each."""
     check_x64(state.cost.dtype)
     proposal = propose(layout, state, damping, options, iteration)
     return try_step(layout, state, damping, proposal, options, min_gain)
 
 
 def propose(
-    layout: Layout, state: LMState, damping: Float[Array, ""], options: StepOptions, iteration: int | Int[Array, ""] = 0
+    layout: Layout,
+    state: LMState,
+    damping: Float[Array, ""],
+    options: StepOptions,
+    iteration: int | Int[Array, ""] = 0,
 ) -> Proposal:
-    """First part of `lm_step`: linearise and solve the damped system. Arguments as for `lm_step`."""
+    """First part of `lm_step`: linearise and solve the damped system. Arguments as for
+    `lm_step`."""
     unknowns = layout.unknowns
     if unknowns.poses.several:
         apart = options.refinement.camera_rounds or options.refinement.pattern_moves
         if options.coordinates.rotation != "manifold" or apart:
-            raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
+            raise ValueError(
+                "rigs need rotation='manifold', and no camera rounds and pattern moves"
+            )
     check_plain(options, shared_lenses=unknowns.shared, residuals=bool(layout.residuals))
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
@@ -127,7 +143,8 @@ def try_step(
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
 ) -> tuple[LMState, StepInfo]:
-    """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
+    """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for
+    `lm_step`."""
     against = comparison(layout, *state, proposal.reference, proposal.step, options, min_gain)
     return take_step(layout, state, damping, proposal, best_candidate(against), options)
 
@@ -140,7 +157,8 @@ def take_step(
     candidate: Candidate,
     options: StepOptions,
 ) -> tuple[LMState, StepInfo]:
-    """End of `try_step`: the state after the accept decision on a candidate, and the record. Arguments as there."""
+    """End of `try_step`: the state after the accept decision on a candidate, and the record.
+    Arguments as there."""
     step = proposal.step
     choose = lambda new, old: jnp.where(candidate.accepted, new, old)
     after = jax.tree.map(choose, LMState(*candidate[:3]), state)
@@ -156,7 +174,9 @@ def take_step(
         damping=jnp.asarray(damping, state.cost.dtype),
         gradient_max=step.gradient_max,
         step_norm=safe_sqrt(jnp.sum(tried[0] ** 2) + moved),
-        parameter_norm=safe_sqrt(jnp.sum(jnp.where(layout.camera_seen, state.cameras, 0) ** 2) + size),
+        parameter_norm=safe_sqrt(
+            jnp.sum(jnp.where(layout.camera_seen, state.cameras, 0) ** 2) + size
+        ),
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
         step_fraction=candidate.step_fraction,

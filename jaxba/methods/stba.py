@@ -1,17 +1,18 @@
-"""Stochastic bundle adjustment (STBA): a step from a system that decomposes into clusters of cameras.
+"""Stochastic bundle adjustment (STBA): a step from a system that decomposes into clusters of
+cameras.
 
 Each iteration draws a partition of the cameras into clusters (structure/random_partitions.py):
 
-1. A point that several clusters see is split into independent point replicas, one per cluster. The reduced camera
-   system of the split problem is block-diagonal, one small dense system per cluster.
+1. A point that several clusters see is split into independent point replicas, one per cluster. The
+   reduced camera system of the split problem is block-diagonal, one small dense system per cluster.
 2. A few Richardson iterations on the true reduced camera system correct the camera step.
 3. The points follow by back-substitution, unsplit.
 
-Lambda damps cameras, points and replicas. With a large lambda the step is nearly a steepest-descent step, in which the
-replicas of a point differ; `consensus_gradient` makes them agree.
+Lambda damps cameras, points and replicas. With a large lambda the step is nearly a steepest-descent
+step, in which the replicas of a point differ; `consensus_gradient` makes them agree.
 
-Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,
-and the authors' code."""
+Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D
+Reconstruction", sections 3 and 4, and the authors' code."""
 
 from __future__ import annotations
 
@@ -37,11 +38,12 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, take_each, take_rows, tree_sum
 
-MIN_CONSENSUS_DAMPING = 1.0  # smallest lambda for which gradients of replicas agree. Source: the authors' code
+# smallest lambda for which gradients of replicas agree. Source: the authors' code
+MIN_CONSENSUS_DAMPING = 1.0
 
 SplitSystem: TypeAlias = tuple[list[list[Array]], list[Array]]
-"""The eliminated point replicas (linear/schur.py), of each slot's replica: Q = J_p L^-T, [2][3] of (slots,), and
-h = L^-1 g, [3] of (slots,)."""
+"""The eliminated point replicas (linear/schur.py), of each slot's replica: Q = J_p L^-T, [2][3] of
+(slots,), and h = L^-1 g, [3] of (slots,)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ class StochasticClusters(StepMethod):
     """The method `stba`."""
 
     cluster_cameras: int = 100  # largest number of cameras in a cluster. Source: the authors' code
-    repairs: int = 4  # Richardson iterations on the true system after the clusters' solution. Source: the authors' code
+    # Richardson iterations on the true system after the clusters' solution. Source: the authors'
+    # code
+    repairs: int = 4
 
     name = "stba"
     rule = "stba"
@@ -69,8 +73,9 @@ class StochasticClusters(StepMethod):
 def clustered_step(
     system: DampedSystem, partition: Partition, options: StepOptions, repairs: int
 ) -> Float[Array, "cameras width"]:
-    """The camera step of one STBA iteration, in manifold coordinates. `system` is that of the unsplit problem, whose
-    layout has pairs; `partition` is that of this iteration, and `repairs` the number of Richardson iterations."""
+    """The camera step of one STBA iteration, in manifold coordinates. `system` is that of the
+    unsplit problem, whose layout has pairs; `partition` is that of this iteration, and `repairs`
+    the number of Richardson iterations."""
     layout, linear, points, cameras, damping = system[:5]
     split = eliminate_replicas(layout, linear, damping, partition, options)
     right = lift_to_cameras(layout, linear, *split) - cameras.gradient  # -sum J_c^T (r - Q h)
@@ -79,7 +84,11 @@ def clustered_step(
 
 
 def eliminate_replicas(
-    layout: Layout, linear: Linearization, damping: Float[Array, ""], partition: Partition, options: StepOptions
+    layout: Layout,
+    linear: Linearization,
+    damping: Float[Array, ""],
+    partition: Partition,
+    options: StepOptions,
 ) -> SplitSystem:
     """As `schur.eliminate_points`, for point replicas."""
     rows = jnp.stack(normal_entries(linear.point_jacobian, linear.residual))
@@ -98,32 +107,45 @@ def eliminate_replicas(
 
 
 def consensus_gradient(
-    layout: Layout, partition: Partition, diagonal: Float[Array, "3 replicas"], gradient: Float[Array, "3 replicas"]
+    layout: Layout,
+    partition: Partition,
+    diagonal: Float[Array, "3 replicas"],
+    gradient: Float[Array, "3 replicas"],
 ) -> Float[Array, "3 replicas"]:
     """Gradients of replicas for which all replicas of a point take the same step `-D_k^-1 g_k`.
 
         g_k <- D_k (sum_j g_j) / (sum_j D_j)
 
-    These are the nearest such gradients in the metric of `D^-1`: the closed form of the published projection
-    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica. `diagonal` is D, the diagonal of
-    the damped block of each replica in the partition of this iteration, and `gradient` is its g."""
-    # Sums over the replicas of a point run over its slots, with weights that sum to one for each replica.
+    These are the nearest such gradients in the metric of `D^-1`: the closed form of the published
+    projection `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica.
+    `diagonal` is D, the diagonal of the damped block of each replica in the partition of this
+    iteration, and `gradient` is its g."""
+    # Sums over the replicas of a point run over its slots, with weights that sum to one for each
+    # replica.
     count = tree_sum(jnp.asarray(layout.slot_mask, gradient.dtype)[:, None], partition.levels)[:, 0]
     weight = jnp.where(count > 0, 1 / jnp.maximum(count, 1), 0)
-    per_slot = take(jnp.concatenate([gradient, diagonal]) * weight, partition.slot_replica) * layout.slot_mask
+    per_slot = (
+        take(jnp.concatenate([gradient, diagonal]) * weight, partition.slot_replica)
+        * layout.slot_mask
+    )
     by_slot = take(point_sum(layout, per_slot), layout.slot_point) * layout.slot_mask
     # back to replicas: all slots of a replica have the same value, so take their mean
     sums = tree_sum(by_slot.T, partition.levels).T * weight
     diagonal_sum = sums[3:]
-    return jnp.where(diagonal_sum > 0, diagonal * sums[:3] / jnp.where(diagonal_sum > 0, diagonal_sum, 1), gradient)
+    return jnp.where(
+        diagonal_sum > 0,
+        diagonal * sums[:3] / jnp.where(diagonal_sum > 0, diagonal_sum, 1),
+        gradient,
+    )
 
 
 def solve_clusters(
     system: DampedSystem, right: Float[Array, "cameras width"], partition: Partition
 ) -> Float[Array, "cameras width"]:
-    """Solves the block-diagonal system of damped camera blocks, one dense factorisation per cluster; of its points only
-    `projected` is used, which couples the cameras of a cluster. Returns the camera step, in manifold coordinates;
-    non-finite for a cluster whose factorisation failed."""
+    """Solves the block-diagonal system of damped camera blocks, one dense factorisation per
+    cluster; of its points only `projected` is used, which couples the cameras of a cluster. Returns
+    the camera step, in manifold coordinates; non-finite for a cluster whose factorisation
+    failed."""
     blocks = reduced_blocks(system)
     blocks = jnp.concatenate([blocks, jnp.eye(blocks.shape[-1], dtype=blocks.dtype)[None]])
     clusters, size = partition.members.shape
@@ -144,8 +166,8 @@ def solve_clusters(
 def richardson(system: DampedSystem, step: Array, rounds: int) -> Float[Array, "cameras width"]:
     """Richardson iterations `x <- x + B^-1 (b - S x)` on the true reduced camera system.
 
-    They converge: each multiplies the error by `B^-1 E C^-1 E^T` (damped B and C), whose spectral radius is below one.
-    """
+    They converge: each multiplies the error by `B^-1 E C^-1 E^T` (damped B and C), whose spectral
+    radius is below one."""
     inverse = block_inverse(computed_after(step, system.cameras.blocks))
     iteration = lambda _, x: x + inverse(system.cameras.right - apply_reduced(system, x))
     return loops.fori_loop(0, rounds, iteration, step)

@@ -1,12 +1,14 @@
-"""Whether the derivatives of a residual agree with differences of it, by one of its unknowns at a time.
+"""Whether the derivatives of a residual agree with differences of it, by one of its unknowns at a
+time.
 
-Steps are shares of the size of what is moved: of the scene for positions, of its own spread for a block of unknowns.
-The right share depends on the function, which may bend within millimetres, and on rounding, which is nanometres in map
-coordinates. So all of `STEPS` are tried. Derivatives are right in a row where some difference agrees with them, and
-wrong where none does although differences of neighbouring steps agree with each other. Where neither is so, as where
-a logarithm of rotations jumps at 180 degrees, the row says nothing. Hence rows are also compared a little away from the
-start. Source: Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)", which takes the step at which differences
-of neighbouring steps agree best."""
+Steps are shares of the size of what is moved: of the scene for positions, of its own spread for a
+block of unknowns. The right share depends on the function, which may bend within millimetres, and
+on rounding, which is nanometres in map coordinates. So all of `STEPS` are tried. Derivatives are
+right in a row where some difference agrees with them, and wrong where none does although
+differences of neighbouring steps agree with each other. Where neither is so, as where a logarithm
+of rotations jumps at 180 degrees, the row says nothing. Hence rows are also compared a little away
+from the start. Source: Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)", which takes
+the step at which differences of neighbouring steps agree best."""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ def check_derivatives(
     start: tuple[Float[np.ndarray, "parameters cameras"], Float[np.ndarray, "3 points"]],
     extent: float,
 ) -> None:
-    """Raises a ProblemError if the derivatives of a residual by one of its unknowns do not agree with differences.
+    """Raises a ProblemError if the derivatives of a residual by one of its unknowns do not agree
+    with differences.
 
     Args:
         kind: the rows of the residual in a layout.
@@ -64,18 +67,24 @@ def check_derivatives(
     random = np.random.default_rng(0)
     names = list(dict.fromkeys(name.removesuffix(SECOND) for name in kind.rows.residual.unknowns))
     sizes = [_sizes(name, kind, unknowns, start, extent) for name in names]
-    changes = [[size * random.standard_normal(size.shape) for size in part] for part in zip(*sizes, strict=True)]
+    changes = [
+        [size * random.standard_normal(size.shape) for size in part]
+        for part in zip(*sizes, strict=True)
+    ]
     changes = tuple(np.stack(part) for part in changes)
     away = tuple(x + AWAY * part.sum(axis=0) for x, part in zip(start, changes, strict=True))
     compared = [
-        jax.device_get(program(_compared, level="quick")(kind, unknowns, place, changes)) for place in (start, away)
+        jax.device_get(program(_compared, level="quick")(kind, unknowns, place, changes))
+        for place in (start, away)
     ]
     for k, name in enumerate(names):
         verdicts = [_judged(rates[k], differences[k]) for rates, differences in compared]
         right, wrong = np.sum(verdicts, axis=(0, 2))
         if wrong > MOST_WRONG * (right + wrong):
             what = kind.rows.residual.name
-            raise ProblemError(f"derivatives of residual {what} do not agree with differences: by {name}")
+            raise ProblemError(
+                f"derivatives of residual {what} do not agree with differences: by {name}"
+            )
 
 
 def _sizes(
@@ -85,7 +94,8 @@ def _sizes(
     start: tuple[np.ndarray, np.ndarray],
     extent: float,
 ) -> tuple[Float[np.ndarray, "parameters cameras"], Float[np.ndarray, "3 points"]]:
-    """How much each number of cameras and points is of what a name means; zero for all other numbers.
+    """How much each number of cameras and points is of what a name means; zero for all other
+    numbers.
 
     Args:
         name: an unknown of the residual, without the ending of a second camera.
@@ -107,7 +117,9 @@ def _sizes(
     else:
         block = slice(*kind.places[kind.rows.residual.unknowns.index(_first(name, kind))])
         numbers = start[0][block][:, np.unique(kind.cameras)]
-        spread = np.abs(numbers - np.median(numbers, axis=1, keepdims=True)).max(axis=1, keepdims=True)
+        spread = np.abs(numbers - np.median(numbers, axis=1, keepdims=True)).max(
+            axis=1, keepdims=True
+        )
         largest = np.abs(numbers).max(axis=1, keepdims=True)
         size = np.where(spread > 0, spread, largest)
         cameras[block] = np.where(size > 0, size, 1.0)
@@ -115,8 +127,11 @@ def _sizes(
 
 
 def _first(name: str, kind: ResidualSlots) -> str:
-    """The first unknown of a residual that has a name, perhaps with the ending of a second camera."""
-    return next(given for given in kind.rows.residual.unknowns if given.removesuffix(SECOND) == name)
+    """The first unknown of a residual that has a name, perhaps with the ending of a second
+    camera."""
+    return next(
+        given for given in kind.rows.residual.unknowns if given.removesuffix(SECOND) == name
+    )
 
 
 def _compared(
@@ -135,7 +150,9 @@ def _compared(
 
     def along(change: tuple[Array, Array]) -> tuple[Array, Array]:
         def moved(step: Array) -> Array:
-            return values(kind, unknowns, *(x + step * d for x, d in zip(place, change, strict=True)))
+            return values(
+                kind, unknowns, *(x + step * d for x, d in zip(place, change, strict=True))
+            )
 
         def difference(step: Array) -> Array:
             return (moved(step) - moved(-step)) / (2 * step)

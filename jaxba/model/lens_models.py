@@ -1,4 +1,5 @@
-"""The pixel of a point in the frame of its camera, and its derivatives: BAL's by formulas, others' by forward mode."""
+"""The pixel of a point in the frame of its camera, and its derivatives: BAL's by formulas, others'
+by forward mode."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from jaxba.typing import AnyArray
 Pair = tuple[Array, Array]
 
 Which = tuple[Int[Array, "..."], ...]  # position of each camera's model, if there are several
-Rows = tuple[list[list[Array]], Callable[[int], Pair]]  # `dz/dP`, [2][3], and `dz/d number k of the lens`
+# `dz/dP`, [2][3], and `dz/d number k of the lens`
+Rows = tuple[list[list[Array]], Callable[[int], Pair]]
 
 
 class Projection(NamedTuple):
@@ -25,7 +27,8 @@ class Projection(NamedTuple):
 
     pixel: Float[Array, "2 ..."] | list[Array]  # f d p
     direction: Float[Array, "2 ..."] | list[Array]  # p = -P.xy / P.z
-    inverse_depth: Float[Array, "..."]  # 1 / P.z; negative in front of the camera, zero where masked
+    # 1 / P.z; negative in front of the camera, zero where masked
+    inverse_depth: Float[Array, "..."]
     radius: Float[Array, "..."]  # |p|^2
     distortion: Float[Array, "..."]  # d = 1 + k1 |p|^2 + k2 |p|^4 of BAL, else 1
     rotated: Float[Array, "3 ..."] | list[Array]  # R X
@@ -43,16 +46,24 @@ class Projection(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class BalLens:
-    """BAL's model, with `d = 1 + k1 |p|^2 + k2 |p|^4` and its derivative `e = k1 + 2 k2 |p|^2` by `|p|^2`:
+    """BAL's model, with `d = 1 + k1 |p|^2 + k2 |p|^4` and its derivative `e = k1 + 2 k2 |p|^2` by
+    `|p|^2`:
 
-    dz/dp = f (d I + 2 e p p^T)      dp/dP = -[I | p] / P.z      dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p"""
+    dz/dp = f (d I + 2 e p p^T)      dp/dP = -[I | p] / P.z      dz/d(f, k1, k2) = (d, f |p|^2, f
+    |p|^4) p"""
 
     def masked(self, local: list[Array], mask: AnyArray) -> list[Array]:
         """Points that may be projected: BAL's formulas are finite wherever the inverse depth is."""
         return local
 
     def pixels(
-        self, lens: list[Array], which: Which, local: list[Array], direction: list[Array], radius: Array, mask: AnyArray
+        self,
+        lens: list[Array],
+        which: Which,
+        local: list[Array],
+        direction: list[Array],
+        radius: Array,
+        mask: AnyArray,
     ) -> tuple[list[Array], Array]:
         """The pixel and the distortion d."""
         focal, k1, k2 = lens
@@ -60,7 +71,9 @@ class BalLens:
         scale = focal * distortion
         return [scale * x for x in direction], distortion
 
-    def undistorted(self, lens: list[Array], which: Which, pixels: list[Array], iterations: int) -> list[Array]:
+    def undistorted(
+        self, lens: list[Array], which: Which, pixels: list[Array], iterations: int
+    ) -> list[Array]:
         """The points of the plane z = -1 that are seen at the pixels, by fixed-point iterations."""
         focal, k1, k2 = lens
         scaled = plane = [row.astype(focal.dtype) / focal for row in pixels]
@@ -100,27 +113,40 @@ class ModelledLens:
 
     def masked(self, local: list[Array], mask: AnyArray) -> list[Array]:
         """Points that may be projected: (0, 0, -1) where masked."""
-        return [jnp.where(mask, row, value) for row, value in zip(local, (0.0, 0.0, -1.0), strict=True)]
+        return [
+            jnp.where(mask, row, value) for row, value in zip(local, (0.0, 0.0, -1.0), strict=True)
+        ]
 
     def pixels(
-        self, lens: list[Array], which: Which, local: list[Array], direction: list[Array], radius: Array, mask: AnyArray
+        self,
+        lens: list[Array],
+        which: Which,
+        local: list[Array],
+        direction: list[Array],
+        radius: Array,
+        mask: AnyArray,
     ) -> tuple[list[Array], Array]:
         """The pixel, and a distortion of one."""
         pixel = self.pixel(which, lens, *local)
         return [jnp.where(mask, row, jnp.zeros_like(row)) for row in pixel], jnp.ones_like(radius)
 
     def pixel(self, which: Which, lens: list[Array], x: Array, y: Array, z: Array) -> Pair:
-        """Pixel of a point x, y, z (scene units) in the frame of each camera, in BAL's axes. `which` is the model of
-        each camera, and `lens` has the numbers of the lenses."""
+        """Pixel of a point x, y, z (scene units) in the frame of each camera, in BAL's axes.
+        `which` is the model of each camera, and `lens` has the numbers of the lenses."""
         last = self.models[-1]
         pixel = last.project(lens[: len(last)], x, -y, -z)
         for number, model in enumerate(self.models[:-1]):
             own = model.project(lens[: len(model)], x, -y, -z)
-            pixel = tuple(jnp.where(which[0] == number, *pair) for pair in zip(own, pixel, strict=True))
+            pixel = tuple(
+                jnp.where(which[0] == number, *pair) for pair in zip(own, pixel, strict=True)
+            )
         return pixel[0], pixel[1]
 
-    def undistorted(self, lens: list[Array], which: Which, pixels: list[Array], iterations: int) -> list[Array]:
-        """The points of the plane z = -1 that are seen at the pixels, by Newton's method from the optical axis."""
+    def undistorted(
+        self, lens: list[Array], which: Which, pixels: list[Array], iterations: int
+    ) -> list[Array]:
+        """The points of the plane z = -1 that are seen at the pixels, by Newton's method from the
+        optical axis."""
         depth = -jnp.ones_like(lens[0])
         pixel_at = lambda x, y: self.pixel(which, lens, x, y, depth)
         x, y = jnp.zeros_like(lens[0]), jnp.zeros_like(lens[0])
@@ -129,11 +155,15 @@ class ModelledLens:
             _, by_y = jax.jvp(lambda y, x=x: pixel_at(x, y), (y,), (jnp.ones_like(y),))
             u, v = (value - pixel for value, pixel in zip(found, pixels, strict=True))
             inverse = 1 / (by_x[0] * by_y[1] - by_x[1] * by_y[0])
-            x, y = x - inverse * (by_y[1] * u - by_y[0] * v), y - inverse * (by_x[0] * v - by_x[1] * u)
+            x, y = (
+                x - inverse * (by_y[1] * u - by_y[0] * v),
+                y - inverse * (by_x[0] * v - by_x[1] * u),
+            )
         return [x, y]
 
     def derivatives(self, lens: list[Array], which: Which, projection: Projection) -> Rows:
-        """By forward mode, one number at a time: each derivative then has only the terms that depend on it."""
+        """By forward mode, one number at a time: each derivative then has only the terms that
+        depend on it."""
         local = list(projection.local)
 
         def rate(function: Callable[[Array], Pair], at: Array) -> Pair:
@@ -146,7 +176,9 @@ class ModelledLens:
             return rate(lambda at: self.pixel(which, lens, *place(at)), local[k])
 
         def by_lens(k: int) -> Pair:
-            return rate(lambda at: self.pixel(which, [*lens[:k], at, *lens[k + 1 :]], *local), lens[k])
+            return rate(
+                lambda at: self.pixel(which, [*lens[:k], at, *lens[k + 1 :]], *local), lens[k]
+            )
 
         places = [by_place(k) for k in range(3)]
         return [[place[row] for place in places] for row in range(2)], by_lens

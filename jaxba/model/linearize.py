@@ -2,8 +2,9 @@
 
     f = 1/2 sum_i rho(|r_i|^2),    r_i = Sigma_i^(-1/2) (predicted - observed)
 
-The robust loss enters the linear model as weights: residuals and Jacobians are scaled by `sqrt(rho'(|r_i|^2))`
-(problem/losses.py), so that `g = J^T r` is the gradient of f and `H = J^T J` its Gauss-Newton Hessian."""
+The robust loss enters the linear model as weights: residuals and Jacobians are scaled by
+`sqrt(rho'(|r_i|^2))` (problem/losses.py), so that `g = J^T r` is the gradient of f and `H = J^T J`
+its Gauss-Newton Hessian."""
 
 from __future__ import annotations
 
@@ -36,8 +37,9 @@ class Reference(NamedTuple):
 class Linearization(NamedTuple):
     """Whitened and weighted residuals and Jacobians; everything is zero in empty slots.
 
-    Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians), translation, then the numbers
-    of the lens that are unknown (structure/unknowns.py): f, k1 and k2 of BAL."""
+    Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians),
+    translation, then the numbers of the lens that are unknown (structure/unknowns.py): f, k1 and k2
+    of BAL."""
 
     residual: list[Array]  # [2] of (slots,), pixels
     camera_jacobian: list[list[Array]]  # [2][width] of (slots,)
@@ -54,7 +56,10 @@ def slot_frames(layout: Layout, cameras: Float[Array, "parameters cameras"]) -> 
 def view_residuals(views: Views, projection: camera.Projection) -> list[Array]:
     """The whitened residual `Sigma^(-1/2) (predicted - observed)`, pixels; zero in empty slots."""
     measured = [row.astype(projection.radius.dtype) for row in views.pixels]
-    return _whiten(views, [predicted - pixel for predicted, pixel in zip(projection.pixel, measured, strict=True)])
+    return _whiten(
+        views,
+        [predicted - pixel for predicted, pixel in zip(projection.pixel, measured, strict=True)],
+    )
 
 
 def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:
@@ -65,27 +70,38 @@ def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:
 
 @traced_once("loss")
 def observation_costs(
-    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 points"],
+    loss: Loss,
 ) -> Float[Array, " slots"]:
     """`slot_costs` at the given parameters; zero in empty slots."""
     terms = lambda views: [slot_costs(loss, view_residuals(views, views.projected()))]
-    return add_costs(layout, cameras, points, view_terms(layout, slot_frames(layout, cameras), points, terms)[0])
+    return add_costs(
+        layout, cameras, points, view_terms(layout, slot_frames(layout, cameras), points, terms)[0]
+    )
 
 
 def cost(
-    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 points"],
+    loss: Loss,
 ) -> Float[Array, ""]:
-    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of other residuals."""
+    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of other
+    residuals."""
     # not fused with the sum: XLA would compile both to a slow library call
-    costs = compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
+    costs = compute_unfused(
+        total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera
+    )
     return sum_over_devices(layout, costs)
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:
     """Point normal equations of every observation, eleven vectors.
 
-    The six lower entries of `J_p^T J_p` row by row, the three of `J_p^T r`, the cost (pixels^2) and the inverse depth.
-    """
+    The six lower entries of `J_p^T J_p` row by row, the three of `J_p^T r`, the cost (pixels^2) and
+    the inverse depth."""
     projection = views.projected()
     residual = view_residuals(views, projection)
     by_point = _whiten_columns(views, camera.derivatives(views.frames, projection, ())[1])
@@ -109,9 +125,13 @@ def normal_entries(by_point: list[list[Array]], residual: list[Array]) -> list[A
 
 @traced_once("loss")
 def linearize(
-    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 points"],
+    loss: Loss,
 ) -> Linearization:
-    """Residuals and analytic Jacobians at the given parameters, whitened and weighted by the robust loss."""
+    """Residuals and analytic Jacobians at the given parameters, whitened and weighted by the robust
+    loss."""
     unknowns = layout.unknowns
 
     def terms(views: Views) -> list[Array]:
@@ -130,26 +150,40 @@ def linearize(
     costs = add_costs(layout, cameras, points, costs)
     for own in layout.residuals:
         found = linearized(own, unknowns, cameras, points)
-        added = [*found.residual, *found.by_camera[0], *found.by_camera[1], *found.by_point[0], *found.by_point[1]]
-        rows = [row.at[found.at].add(one, mode="drop") for row, one in zip(rows, added, strict=True)]
+        added = [
+            *found.residual,
+            *found.by_camera[0],
+            *found.by_camera[1],
+            *found.by_point[0],
+            *found.by_point[1],
+        ]
+        rows = [
+            row.at[found.at].add(one, mode="drop") for row, one in zip(rows, added, strict=True)
+        ]
     residual, rows = rows[:2], rows[2:]
     width = (len(rows) - 6) // 2
     by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
     return Linearization(residual, by_camera, by_point, Reference(costs, inverse_depth))
 
 
-def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
-    """Whether the loss gives weight to no observation though there is a cost: gradient and Hessian are zero."""
+def is_weightless(
+    layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss
+) -> Bool[Array, ""]:
+    """Whether the loss gives weight to no observation though there is a cost: gradient and Hessian
+    are zero."""
     if loss.trivial:
         return jnp.zeros((), bool)
     first, second = linear.residual
     return (sum_over_devices(layout, total(first * first + second * second)) == 0) & (cost > 0)
 
 
-def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False) -> Linearization:
-    """The linear model in the unknowns: columns of what is constant are zero. Its gradient, and so its step, is then
-    zero, too. `layout` knows what is constant; with `fixed` intrinsics all of these are. `alone`: whether cameras are
-    optimised one by one, so that what they share must be constant."""
+def only_free(
+    layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False
+) -> Linearization:
+    """The linear model in the unknowns: columns of what is constant are zero. Its gradient, and so
+    its step, is then zero, too. `layout` knows what is constant; with `fixed` intrinsics all of
+    these are. `alone`: whether cameras are optimised one by one, so that what they share must be
+    constant."""
     unknowns, zero = layout.unknowns, jnp.zeros_like(linear.residual[0])
     constant = unknowns.constant(intrinsics, alone=alone)
     free = unknowns.free.at_columns(layout.slot_camera)

@@ -1,6 +1,8 @@
-"""Evaluation of functions of an observation, its camera and its point: per slot, and summed over each point.
+"""Evaluation of functions of an observation, its camera and its point: per slot, and summed over
+each point.
 
-The functions are written once, for a `Views`; here they are evaluated in one fused loop over all slots."""
+The functions are written once, for a `Views`; here they are evaluated in one fused loop over all
+slots."""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ class Views(NamedTuple):
     def projected(self) -> camera.Projection:
         """The projections of the points.
 
-        Materialised under fast compilation, where each vector computed from them has a loop of its own."""
+        Materialised under fast compilation, where each vector computed from them has a loop of its
+        own."""
         projection = camera.project(self.frames, self.points, self.mask)
         return projection.stacked() if fast_compilation.value else projection
 
@@ -39,11 +42,16 @@ Terms = Callable[..., list[Array]]  # of `Views` and further vectors over the sa
 
 
 def view_terms(
-    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], terms: Terms, *slots: Array
+    layout: Layout,
+    frames: camera.Frames,
+    points: Float[Array, "3 points"],
+    terms: Terms,
+    *slots: Array,
 ) -> list[Float[Array, " slots"]]:
-    """Evaluates a function of an observation, its camera and its point for every slot, in one loop. Returns a vector
-    over slots for each term. `frames` are the cameras of every slot, materialised (`linearize.slot_frames`), `points`
-    are the current ones, and `slots` are further arguments of the function, vectors over slots."""
+    """Evaluates a function of an observation, its camera and its point for every slot, in one loop.
+    Returns a vector over slots for each term. `frames` are the cameras of every slot, materialised
+    (`linearize.slot_frames`), `points` are the current ones, and `slots` are further arguments of
+    the function, vectors over slots."""
     return compute_in_one_loop(terms, _views(layout, frames, points), *slots)
 
 
@@ -52,11 +60,16 @@ def _views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 points
     return Views(frames, at_slots, layout.slot_mask, layout.pixels, layout.whitening)
 
 
-def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
-    """`view_terms` summed over the observations of each point, as a function of the points. Returns a function of
-    points, `Terms` and further vectors over slots, which returns a vector over points for each term."""
+def point_passes(
+    layout: Layout, frames: camera.Frames
+) -> Callable[..., list[Float[Array, " points"]]]:
+    """`view_terms` summed over the observations of each point, as a function of the points. Returns
+    a function of points, `Terms` and further vectors over slots, which returns a vector over points
+    for each term."""
 
-    def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
+    def one_pass(
+        points: Float[Array, "3 points"], terms: Terms, *slots: Array
+    ) -> list[Float[Array, " points"]]:
         return point_sums_of(layout, terms, _views(layout, frames, points), *slots)
 
     return one_pass

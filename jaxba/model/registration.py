@@ -1,4 +1,5 @@
-"""`with_residual`: rows of a residual registered with a problem, and what is wrong with them said at once."""
+"""`with_residual`: rows of a residual registered with a problem, and what is wrong with them said
+at once."""
 
 from __future__ import annotations
 
@@ -36,25 +37,36 @@ CHECKED_INDICES = "jax_check_static_indices"  # a setting of JAX
 
 
 def with_residual(
-    problem: BundleProblem, rows: Rows, *, loss: Loss | None = None, unknowns: Mapping[str, Any] | None = None
+    problem: BundleProblem,
+    rows: Rows,
+    *,
+    loss: Loss | None = None,
+    unknowns: Mapping[str, Any] | None = None,
 ) -> BundleProblem:
     """The problem with rows of a residual of one's own (`jaxba.residual`).
 
-    The cost has `1/2 rho(|r|^2)` for each row, with r as the function returns it. Points are eliminated as for pixels.
-    Raises ValueError, ProblemError: an index is out of range, a block is missing or malformed, unknowns of a row belong
-    to different cameras without saying so (`_2`), or the function cannot be computed, is not finite at the start,
-    depends on a parameter in no row, or has other derivatives than differences; one line.
+    The cost has `1/2 rho(|r|^2)` for each row, with r as the function returns it. Points are
+    eliminated as for pixels. Raises ValueError, ProblemError: an index is out of range, a block is
+    missing or malformed, unknowns of a row belong to different cameras without saying so (`_2`), or
+    the function cannot be computed, is not finite at the start, depends on a parameter in no row,
+    or has other derivatives than differences; one line.
 
     Args:
         problem: any problem.
         rows: a residual called with its indices and data.
         loss: robust loss of the squared norm of a row; None: squared.
-        unknowns: start of each new block by its name, shape (n, numbers): a row for each camera, or fewer, which
-            several cameras have in common. `Solution.problem.residuals` has their values after a solve."""
+        unknowns: start of each new block by its name, shape (n, numbers): a row for each camera, or
+            fewer, which several cameras have in common. `Solution.problem.residuals` has their
+            values after a solve."""
     if not isinstance(rows, Rows):
-        raise ValueError(f"rows must be those of a residual, called with indices and data, not {shown(rows)}")
+        raise ValueError(
+            f"rows must be those of a residual, called with indices and data, not {shown(rows)}"
+        )
     if not isinstance(loss, Loss | None) or not isinstance(unknowns, Mapping | None):
-        raise ValueError(f"loss must be a jaxba.Loss and unknowns a dict, not {shown(loss)} and {shown(unknowns)}")
+        raise ValueError(
+            f"loss must be a jaxba.Loss and unknowns a dict, not {shown(loss)} and "
+            f"{shown(unknowns)}"
+        )
     if not len(rows):
         return problem
     lenses = problem.num_cameras if problem.lenses is None else len(problem.lenses.free)
@@ -97,7 +109,8 @@ class LaidRows(NamedTuple):
     kinds: tuple[ResidualSlots, ...]
     unknowns: Unknowns
     parameters: tuple[jax.Array, jax.Array]  # of cameras, by their numbers, and of points
-    groups: tuple[np.ndarray, ...]  # for each block of residuals the row that each camera has; negative for none
+    # for each block of residuals the row that each camera has; negative for none
+    groups: tuple[np.ndarray, ...]
 
 
 def rows_of(problem: BundleProblem) -> LaidRows:
@@ -113,7 +126,8 @@ def rows_of(problem: BundleProblem) -> LaidRows:
 
 
 def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residual]:
-    """Numbers in a row of the last residual, if there is nothing wrong with it, and that residual with its source."""
+    """Numbers in a row of the last residual, if there is nothing wrong with it, and that residual
+    with its source."""
     name = residuals.rows[-1].residual.name
     with numerics(np.float64):
         problem = problem.replace(residuals=residuals)
@@ -127,9 +141,15 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residua
             raise ValueError(f"residual {name} cannot be computed: {shown(text, 200)}") from error
         _check_lengths(kind, of, at, float(math.prod(shape[1:])))
         if len(shape) != 2 or not shape[1]:
-            raise ValueError(f"residual {name} must return a number or a vector, not an array of shape {shape[:0:-1]}")
+            raise ValueError(
+                f"residual {name} must return a number or a vector, not an array of shape "
+                f"{shape[:0:-1]}"
+            )
         if len(kind.points) > 1 and shape[1] > POSE_SIZE:  # of the camera that splits it
-            raise ValueError(f"residual {name} has two points in a row, so at most {POSE_SIZE} numbers, not {shape[1]}")
+            raise ValueError(
+                f"residual {name} has two points in a row, so at most {POSE_SIZE} numbers, not "
+                f"{shape[1]}"
+            )
         known = replace(kind.rows.residual, source=_source(traced))
         kind = replace(kind, rows=replace(kind.rows, size=shape[1], loss=Loss(), residual=known))
         found = jax.device_get(program(_derivatives, level="quick")(kind, of, at))
@@ -144,7 +164,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residua
 
 
 def _check_values(labels: Labels | None, rows: Rows) -> None:
-    """Raises a ValueError that names a row whose data cannot be what they are of a ready-made residual."""
+    """Raises a ValueError that names a row whose data cannot be what they are of a ready-made
+    residual."""
     kinds = dict(rows.residual.kinds)
     for name, values in zip(rows.residual.data, rows.data, strict=True):
         if name in kinds and (wrong := kinds[name].wrong(np.asarray(values))):
@@ -165,10 +186,13 @@ def _row_name(labels: Labels | None, rows: Rows, row: int) -> str:
     return ", ".join(names) or f"row {row}"
 
 
-def _traced(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any]) -> tuple[Any, tuple[int, ...]]:
+def _traced(
+    kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any]
+) -> tuple[Any, tuple[int, ...]]:
     """What a residual computes, and the shape of its values, rows first."""
 
-    def values(*given: Any) -> jax.Array:  # a new function: an earlier trace may have had other globals
+    # a new function: an earlier trace may have had other globals
+    def values(*given: Any) -> jax.Array:
         return model.values(*given)
 
     with _checked_indices():
@@ -176,9 +200,12 @@ def _traced(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any]) -> tup
     return traced, result.shape[::-1]
 
 
-def _check_lengths(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any], size: float) -> None:
-    """Raises a ValueError for an array of another length that counts, whole, for each row, where rows have fewer
-    numbers than `size` with one of its entries: it was meant to have an entry for each row."""
+def _check_lengths(
+    kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any], size: float
+) -> None:
+    """Raises a ValueError for an array of another length that counts, whole, for each row, where
+    rows have fewer numbers than `size` with one of its entries: it was meant to have an entry for
+    each row."""
     names, data = kind.rows.residual.data, kind.rows.data
     for name in kind.rows.whole:
         k = names.index(name)
@@ -189,7 +216,8 @@ def _check_lengths(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any],
 
 
 def _size(kind: ResidualSlots, unknowns: Unknowns, at: tuple[Any, Any]) -> float:
-    """How many numbers a row of a residual has; infinite if it cannot be computed, or is no number or vector."""
+    """How many numbers a row of a residual has; infinite if it cannot be computed, or is no number
+    or vector."""
     try:
         _, shape = _traced(kind, unknowns, at)
     except Exception:
@@ -209,7 +237,8 @@ def _checked_indices() -> Iterator[None]:
 
 
 def _source(traced: Any) -> str:
-    """A digest of what a function does, with all that it closes over; empty where its text does not say all of it."""
+    """A digest of what a function does, with all that it closes over; empty where its text does not
+    say all of it."""
     text = str(traced)
     if any(word in text for word in ("custom_jvp", "custom_vjp", "callback", "0x")):
         return ""
@@ -224,24 +253,38 @@ def _constants(found: Any) -> list[Any]:
     if isinstance(found, tuple | list):
         return [x for one in found for x in _constants(one)]
     equations = getattr(getattr(found, "jaxpr", found), "eqns", ())
-    return [*getattr(found, "consts", ()), *(x for one in equations for x in _constants([*one.params.values()]))]
+    return [
+        *getattr(found, "consts", ()),
+        *(x for one in equations for x in _constants([*one.params.values()])),
+    ]
 
 
-def _derivatives(kind: ResidualSlots, unknowns: Unknowns, at: tuple[jax.Array, jax.Array]) -> list[Any]:
+def _derivatives(
+    kind: ResidualSlots, unknowns: Unknowns, at: tuple[jax.Array, jax.Array]
+) -> list[Any]:
     """Values and derivatives of all rows."""
     return [numbers.tolist() for numbers in model.differentiated(kind, unknowns, *at)[:3]]
 
 
-def _check_dependence(kind: ResidualSlots, unknowns: Unknowns, by_camera: np.ndarray, by_point: np.ndarray) -> None:
-    """Raises a ValueError for a parameter that the residual depends on in no row, or whose derivative is not finite."""
+def _check_dependence(
+    kind: ResidualSlots, unknowns: Unknowns, by_camera: np.ndarray, by_point: np.ndarray
+) -> None:
+    """Raises a ValueError for a parameter that the residual depends on in no row, or whose
+    derivative is not finite."""
     numbers = np.array([*range(POSE_SIZE), *(POSE_SIZE + column for column in unknowns.columns)])
     what = f"residual {kind.rows.residual.name}"
     for name, (start, end) in zip(kind.rows.residual.unknowns, kind.places, strict=True):
         base = name.removesuffix(SECOND)
-        which = int(name.endswith(SECOND) and len(kind.points if base == POINT else kind.cameras) > 1)
+        which = int(
+            name.endswith(SECOND) and len(kind.points if base == POINT else kind.cameras) > 1
+        )
         lens = POSE_SIZE, POSE_SIZE + unknowns.lens_size
         first, last = {POSE: (0, POSE_SIZE), LENS: lens}.get(base, (start, end))
-        own = by_point[:, which] if base == POINT else by_camera[:, which, (numbers >= first) & (numbers < last)]
+        own = (
+            by_point[:, which]
+            if base == POINT
+            else by_camera[:, which, (numbers >= first) & (numbers < last)]
+        )
         if not np.isfinite(own).all():
             raise ValueError(f"the derivative of {what} by {name} is not finite at the start")
         if own.size and not own.any():

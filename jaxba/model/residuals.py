@@ -1,5 +1,5 @@
-"""Residuals of one's own among the slots of observations (structure/residual_slots.py): their costs, linear models, and
-parts in sums over points."""
+"""Residuals of one's own among the slots of observations (structure/residual_slots.py): their
+costs, linear models, and parts in sums over points."""
 
 from __future__ import annotations
 
@@ -37,22 +37,32 @@ def row_costs(rows: Rows, residual: Float[Array, "size rows"]) -> Float[Array, "
 
 
 def add_costs(
-    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], costs: Array
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 points"],
+    costs: Array,
 ) -> Float[Array, " slots"]:
     """Costs of slots with those of all rows, whose cameras or points have equal parts of them."""
     for rows in layout.residuals:
-        own = row_costs(rows.rows, values(rows, layout.unknowns, cameras, points)) / rows.slots.shape[1]
+        own = (
+            row_costs(rows.rows, values(rows, layout.unknowns, cameras, points))
+            / rows.slots.shape[1]
+        )
         at = jnp.asarray(rows.slots)[0]
         costs = costs.at[at].add(jnp.broadcast_to(own, at.shape), mode="drop")
     return costs
 
 
 def add_point_terms(
-    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], sums: list[Array]
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 points"],
+    sums: list[Array],
 ) -> list[Float[Array, " points"]]:
-    """Sums over the observations of points, of the first ten `linearize.point_terms` or of costs alone, with those of
-    all rows: of a row without a point only its cost, at the point that stands for it, and of one of two points half of
-    it at each, since these do not move alone (`points_alone`)."""
+    """Sums over the observations of points, of the first ten `linearize.point_terms` or of costs
+    alone, with those of all rows: of a row without a point only its cost, at the point that stands
+    for it, and of one of two points half of it at each, since these do not move alone
+    (`points_alone`)."""
     sums, cost = list(sums), 9 if len(sums) > 1 else 0
     for rows in layout.residuals:
         at = _points_of(layout, rows)
@@ -65,34 +75,52 @@ def add_point_terms(
         by_point = found.by_point[:, 0]
         terms = [(by_point[:, i] * by_point[:, j]).sum() for i in range(3) for j in range(i + 1)]
         terms += [*(by_point * found.residual[:, None]).sum(axis=0), found.costs]
-        sums[:10] = [x.at[at[0]].add(term, mode="drop") for x, term in zip(sums[:10], terms, strict=True)]
+        sums[:10] = [
+            x.at[at[0]].add(term, mode="drop") for x, term in zip(sums[:10], terms, strict=True)
+        ]
     return sums
 
 
 def _points_of(layout: Layout, rows: ResidualSlots) -> Int[Array, "ends rows"]:
-    """The points at the slots of rows; out of range for a row that is none, as of a shard without rows."""
-    return jnp.asarray(layout.slot_point).at[rows.slots[0]].get(mode="fill", fill_value=layout.num_points)
+    """The points at the slots of rows; out of range for a row that is none, as of a shard without
+    rows."""
+    return (
+        jnp.asarray(layout.slot_point)
+        .at[rows.slots[0]]
+        .get(mode="fill", fill_value=layout.num_points)
+    )
 
 
 def points_alone(layout: Layout) -> Mask:
-    """Which points may move while all others stay: those that are free, and in no row with another point."""
-    free, pairs = layout.unknowns.free_points, [_points_of(layout, x) for x in layout.residuals if len(x.points) > 1]
+    """Which points may move while all others stay: those that are free, and in no row with another
+    point."""
+    free, pairs = (
+        layout.unknowns.free_points,
+        [_points_of(layout, x) for x in layout.residuals if len(x.points) > 1],
+    )
     if not pairs:
         return free
-    alone = jnp.ones(layout.num_points, bool).at[jnp.concatenate(pairs, axis=1)].set(False, mode="drop")
+    alone = (
+        jnp.ones(layout.num_points, bool).at[jnp.concatenate(pairs, axis=1)].set(False, mode="drop")
+    )
     return Mask(free.where(alone, False), False)
 
 
 def linearized(
-    rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
+    rows: ResidualSlots,
+    unknowns: Unknowns,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 _"],
 ) -> Linear:
     """Residuals and Jacobians of rows, at their slots."""
     found, (pairs, several, _) = differentiated(rows, unknowns, cameras, points), rows.slots.shape
     zero = jnp.zeros_like(found.costs)
-    split = ROOT if several > 1 else 1.0  # of a row of two cameras or points each has half of the residual
+    # of a row of two cameras or points each has half of the residual
+    split = ROOT if several > 1 else 1.0
 
     def at_slots(of: Callable[[int, int], Any]) -> tuple[Array, ...]:
-        """For each of a pair of numbers a vector over slots, of what there is of a number of rows and of an end."""
+        """For each of a pair of numbers a vector over slots, of what there is of a number of rows
+        and of an end."""
         vectors = []
         for k in range(2):
             numbers = [(2 * pair + k, end) for pair in range(pairs) for end in range(several)]
@@ -100,7 +128,8 @@ def linearized(
             vectors.append(parts[0] if len(parts) == 1 else jnp.concatenate(parts))
         return tuple(vectors)
 
-    sign = lambda here, end: jnp.full_like(zero, (1 - 2 * end) * here)  # of the variables that split it
+    # of the variables that split it
+    sign = lambda here, end: jnp.full_like(zero, (1 - 2 * end) * here)
     residual = at_slots(lambda number, end: found.residual[number] / several)
     by_camera = lambda w: lambda number, end: found.by_camera[number, end, w]
     by_point = lambda i: lambda number, end: found.by_point[number, end, i]
@@ -108,6 +137,9 @@ def linearized(
         by_camera = lambda w: lambda number, end: sign(number == w, end)
     if len(rows.cameras) > 1:
         by_point = lambda i: lambda number, end: sign(number % 2 == i, end)
-    columns = [at_slots(by_camera(w)) for w in range(unknowns.width)], [at_slots(by_point(i)) for i in range(3)]
+    columns = (
+        [at_slots(by_camera(w)) for w in range(unknowns.width)],
+        [at_slots(by_point(i)) for i in range(3)],
+    )
     jacobians = ([list(row) for row in zip(*each, strict=True)] for each in columns)
     return Linear(jnp.asarray(rows.slots).reshape(-1), list(residual), *jacobians)

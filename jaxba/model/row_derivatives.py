@@ -1,9 +1,10 @@
 """Values and derivatives of residuals of one's own.
 
-Functions see poses and points as they were when the residuals were registered (`Rows.scale`), a row at a time. They are
-differentiated backwards, number by number, as operations on vectors over all rows (model/vectors.py); what has no rule
-there JAX maps over the rows, backwards or, where it cannot be transposed, forwards. Derivatives are in the coordinates
-of the camera Jacobian (model/linearize.py)."""
+Functions see poses and points as they were when the residuals were registered (`Rows.scale`), a row
+at a time. They are differentiated backwards, number by number, as operations on vectors over all
+rows (model/vectors.py); what has no rule there JAX maps over the rows, backwards or, where it
+cannot be transposed, forwards. Derivatives are in the coordinates of the camera Jacobian
+(model/linearize.py)."""
 
 from __future__ import annotations
 
@@ -30,8 +31,9 @@ from jaxba.structure.segment_sums import take_each
 from jaxba.structure.unknowns import Unknowns
 
 LARGEST = 1_000
-"""Most operations that a residual is differentiated as on vectors. Measured on chains of sines: a solve compiles 1.8
-times as long as with the mapped function for 1,080, 2.5 times for 3,600, 7 times for 9,720. A projection has 300."""
+"""Most operations that a residual is differentiated as on vectors. Measured on chains of sines: a
+solve compiles 1.8 times as long as with the mapped function for 1,080, 2.5 times for 3,600, 7 times
+for 9,720. A projection has 300."""
 
 
 class Differentiated(NamedTuple):
@@ -44,14 +46,22 @@ class Differentiated(NamedTuple):
 
 
 def values(
-    rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
+    rows: ResidualSlots,
+    unknowns: Unknowns,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 _"],
 ) -> Float[Array, "size rows"]:
     """The residual of every row, whitened by the function, without the loss."""
-    return jax.vmap(functools.partial(_value, rows, unknowns), -1, -1)(*_gathered(rows, unknowns, cameras, points))
+    return jax.vmap(functools.partial(_value, rows, unknowns), -1, -1)(
+        *_gathered(rows, unknowns, cameras, points)
+    )
 
 
 def differentiated(
-    rows: ResidualSlots, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 _"]
+    rows: ResidualSlots,
+    unknowns: Unknowns,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 _"],
 ) -> Differentiated:
     """Residuals, Jacobians and costs of all rows."""
     given, size = _gathered(rows, unknowns, cameras, points), rows.rows.size
@@ -61,12 +71,15 @@ def differentiated(
         found = _mapped(rows, unknowns, *given)
     shapes = (size,), (size, len(rows.cameras), unknowns.width), (size, len(rows.points), 3)
     parts = np.split(filled(found[:-1]), np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-    residual, by_camera, by_point = (part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
+    residual, by_camera, by_point = (
+        part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)
+    )
     return Differentiated(residual, by_camera, by_point, found[-1])
 
 
 def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Array]:
-    """The numbers of `Differentiated`. Raises NotImplementedError: no rule for something in it, or too large."""
+    """The numbers of `Differentiated`. Raises NotImplementedError: no rule for something in it, or
+    too large."""
     over_rows = given[3].ndim - 2
     numbers = [numbers_of(x, x.ndim - over_rows) for x in given]
     function, parameters = Traced(functools.partial(_value, rows, unknowns), *numbers), numbers[:4]
@@ -80,11 +93,23 @@ def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[
 
     residual, derivatives = [], []
     for k in range(rows.rows.size):
-        one, pull = jax.vjp(functools.partial(number, k), *(x for part in parameters for x in part.flat))
+        one, pull = jax.vjp(
+            functools.partial(number, k), *(x for part in parameters for x in part.flat)
+        )
         residual.append(one)
         derivatives += pull(jnp.ones_like(one))
-    by_parts = zip(np.split(filled(derivatives).reshape(len(residual), -1), ends, axis=1), parameters, strict=True)
-    return _weighted(rows.rows, unknowns, numbers, filled(residual), *(by.reshape(-1, *x.shape) for by, x in by_parts))
+    by_parts = zip(
+        np.split(filled(derivatives).reshape(len(residual), -1), ends, axis=1),
+        parameters,
+        strict=True,
+    )
+    return _weighted(
+        rows.rows,
+        unknowns,
+        numbers,
+        filled(residual),
+        *(by.reshape(-1, *x.shape) for by, x in by_parts),
+    )
 
 
 def _mapped(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Array]:
@@ -102,7 +127,8 @@ def _mapped(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Arra
     each = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
     try:
         residual, by_parts = each(backward)(*given)
-    except (ValueError, TypeError, NotImplementedError):  # a loop of unknown length, or a rule for forward mode alone
+    # a loop of unknown length, or a rule for forward mode alone
+    except (ValueError, TypeError, NotImplementedError):
         residual, by_parts = each(forward)(*given)
     numbers = lambda arrays: [numbers_of(x, x.ndim - 1) for x in arrays]
     return _weighted(rows.rows, unknowns, numbers(given), *numbers((residual, *by_parts)))
@@ -118,7 +144,8 @@ def _weighted(
     own: Numbers,
     by_point: Numbers,
 ) -> list[Array]:
-    """The numbers of `Differentiated`, for derivatives by rotations, translations, numbers of cameras, points."""
+    """The numbers of `Differentiated`, for derivatives by rotations, translations, numbers of
+    cameras, points."""
     # R <- R + [w]x R changes the residual by w . sum of R_j x dr/dR_j over columns j
     turn = _cross(given[0], turn, -2).sum(axis=-1)
     if unknowns.in_rigs:  # R = M R_f and t = M t_f + m, with steps of frames and of M and m
@@ -142,19 +169,29 @@ def _cross(one: Numbers, other: Numbers, axis: int) -> Numbers:
     return a * q - b * p
 
 
-def _gathered(rows: ResidualSlots, unknowns: Unknowns, cameras: Array, points: Array) -> tuple[Array, ...]:
-    """What a row needs of the problem, along the last axis: rotations, translations and numbers of its cameras, its
-    points; in a rig M and M t_f; camera models, and the data."""
+def _gathered(
+    rows: ResidualSlots, unknowns: Unknowns, cameras: Array, points: Array
+) -> tuple[Array, ...]:
+    """What a row needs of the problem, along the last axis: rotations, translations and numbers of
+    its cameras, its points; in a rig M and M t_f; camera models, and the data."""
     frames = camera.frames(jnp.asarray(cameras), unknowns)
-    rotation, translation, places = jnp.asarray(frames.rotation), jnp.asarray(frames.translation), []
+    rotation, translation, places = (
+        jnp.asarray(frames.rotation),
+        jnp.asarray(frames.translation),
+        [],
+    )
     for place in frames.places:
         matrix = jnp.asarray(place)[:9].reshape(3, 3, -1)
         shifted = jnp.einsum("ijc,jc->ic", matrix, translation, precision="highest")
         rotation = jnp.einsum("ijc,jkc->ikc", matrix, rotation, precision="highest")
         translation, places = shifted + jnp.asarray(place)[9:], [matrix.reshape(9, -1), shifted]
-    table = fusion_barrier(jnp.concatenate([rotation.reshape(9, -1), translation, *places, cameras[POSE_SIZE:]]))
+    table = fusion_barrier(
+        jnp.concatenate([rotation.reshape(9, -1), translation, *places, cameras[POSE_SIZE:]])
+    )
     index, end = [jnp.asarray(one) for one in rows.cameras], 12 + 12 * len(frames.places)
-    table = jnp.stack([jnp.stack(compute_unfused(take_each, table, one, index=one)) for one in index])
+    table = jnp.stack(
+        [jnp.stack(compute_unfused(take_each, table, one, index=one)) for one in index]
+    )
     model = jnp.stack([jnp.asarray(unknowns.model)[one] for one in index])
     data = (jnp.moveaxis(jnp.asarray(x, cameras.dtype), 0, -1) for x in rows.rows.data)
     matrices = table[:, :9].reshape(len(index), 3, 3, -1)
@@ -175,5 +212,8 @@ def _value(
 ) -> Float[Array, " size"]:
     """The function at one row."""
     given = Cameras(rotation, translation, numbers[:, : unknowns.lens_size], model, unknowns.models)
-    blocks = [numbers[:, max(0, first - POSE_SIZE) : max(0, last - POSE_SIZE)] for first, last in rows.places]
+    blocks = [
+        numbers[:, max(0, first - POSE_SIZE) : max(0, last - POSE_SIZE)]
+        for first, last in rows.places
+    ]
     return value(rows.rows, given, points, blocks, data)

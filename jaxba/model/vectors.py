@@ -1,8 +1,10 @@
-"""A function of small arrays, for one row, as operations on vectors over all rows: one for each of its numbers.
+"""A function of small arrays, for one row, as operations on vectors over all rows: one for each of
+its numbers.
 
-JAX can map such a function over rows itself (`jax.vmap`), but then reading a number of an array is a slice of an array
-over rows, and stacking numbers copies them, which XLA does not fuse and whose transposes are pads. Here the function
-is traced once, and what only moves numbers about disappears."""
+JAX can map such a function over rows itself (`jax.vmap`), but then reading a number of an array is
+a slice of an array over rows, and stacking numbers copies them, which XLA does not fuse and whose
+transposes are pads. Here the function is traced once, and what only moves numbers about
+disappears."""
 
 from __future__ import annotations
 
@@ -16,17 +18,20 @@ import numpy as np
 from jax import Array
 from jaxtyping import Shaped
 
-CALLS, ELEMENTWISE = (  # primitives that hold a function, and that compute each number from those at its place
+# primitives that hold a function, and that compute each number from those at its place
+CALLS, ELEMENTWISE = (
     frozenset(names.split())
     for names in (
         "jit pjit",
-        """abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos cosh div eq
-        erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem
-        round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor""",
+        """abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type
+        copy cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p
+        logistic lt max min mul ne neg not or pow rem round rsqrt select_n sign sin sinh
+        sqrt square stop_gradient sub tan tanh xor""",
     )
 )
 
-Numbers = Shaped[np.ndarray, "..."]  # vectors or scalars of JAX in an array of objects, of the shape of one row's array
+# vectors or scalars of JAX in an array of objects, of the shape of one row's array
+Numbers = Shaped[np.ndarray, "..."]
 
 
 def numbers_of(x: Array, rank: int) -> Numbers:
@@ -35,7 +40,9 @@ def numbers_of(x: Array, rank: int) -> Numbers:
     return filled([x[place] for place in np.ndindex(shape)], shape)
 
 
-def _broadcast(x: Numbers, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: Any) -> Numbers:
+def _broadcast(
+    x: Numbers, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: Any
+) -> Numbers:
     axes = [k for k in range(len(shape)) if k not in broadcast_dimensions]
     return np.broadcast_to(np.expand_dims(x, axes), shape)
 
@@ -54,7 +61,9 @@ MOVES: dict[str, Callable[..., Any]] = {  # primitives that only move numbers, i
     "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
     "stack": lambda *parts, axis, **_: np.stack(parts, axis),
     "transpose": lambda x, permutation: x.transpose(permutation),
-    "unstack": lambda x, axis, **_: [np.squeeze(one, axis) for one in np.split(x, x.shape[axis], axis)],
+    "unstack": lambda x, axis, **_: [
+        np.squeeze(one, axis) for one in np.split(x, x.shape[axis], axis)
+    ],
 }
 
 
@@ -63,19 +72,26 @@ class Traced:
 
     def __init__(self, function: Callable[..., Array], *operands: Numbers) -> None:
         """Traces it for operands of these shapes."""
-        row = [jax.ShapeDtypeStruct(x.shape, x.flat[0].dtype if x.size else float) for x in operands]
+        row = [
+            jax.ShapeDtypeStruct(x.shape, x.flat[0].dtype if x.size else float) for x in operands
+        ]
         self._closed = jax.make_jaxpr(function)(*row)
         self.size = _size(self._closed)
 
     def __call__(self, *operands: Numbers) -> Numbers:
-        """Its numbers for all rows, of one shape. Raises NotImplementedError: no rule for an operation."""
+        """Its numbers for all rows, of one shape. Raises NotImplementedError: no rule for an
+        operation."""
         (found,) = _evaluated(self._closed, operands)
         return found
 
 
 def _size(closed: Any) -> int:
     """Number of operations on vectors."""
-    own = lambda x: _size(x.params["jaxpr"]) if x.primitive.name in CALLS else math.prod(x.outvars[0].aval.shape)
+    own = lambda x: (
+        _size(x.params["jaxpr"])
+        if x.primitive.name in CALLS
+        else math.prod(x.outvars[0].aval.shape)
+    )
     return sum(own(x) for x in closed.jaxpr.eqns if x.primitive.name not in MOVES)
 
 
@@ -105,7 +121,11 @@ def filled(values: Sequence[Any], shape: tuple[int, ...] = (-1,)) -> Numbers:
 
 def _applied(equation: Any, given: list[Numbers]) -> list[Numbers]:
     """The results of a primitive."""
-    name, parameters, shape = equation.primitive.name, equation.params, equation.outvars[0].aval.shape
+    name, parameters, shape = (
+        equation.primitive.name,
+        equation.params,
+        equation.outvars[0].aval.shape,
+    )
     total = lambda rows: filled([sum(row[1:], start=row[0]) for row in rows], shape)
     if name in CALLS:
         return _evaluated(parameters["jaxpr"], given)
@@ -129,4 +149,6 @@ def _applied(equation: Any, given: list[Numbers]) -> list[Numbers]:
 
 def _bound(equation: Any, numbers: tuple[Any, ...]) -> Array:
     shape = np.broadcast_shapes(*map(np.shape, numbers))
-    return equation.primitive.bind(*(jnp.broadcast_to(x, shape) for x in numbers), **equation.params)
+    return equation.primitive.bind(
+        *(jnp.broadcast_to(x, shape) for x in numbers), **equation.params
+    )

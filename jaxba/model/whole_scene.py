@@ -1,14 +1,17 @@
 """A scene moved, turned and scaled as a whole to what was measured besides its pixels.
 
-Pixels stay as they are under a similarity of the scene, x -> s R x + t; other residuals do not. Their cost
+Pixels stay as they are under a similarity of the scene, x -> s R x + t; other residuals do not.
+Their cost
 
     f(s, R, t, b) = 1/2 sum_k sum_rows rho_k(|r_k|^2)
 
-is minimised over the similarity and the blocks b of unknowns that only these residuals have, with cameras and points as
-a rigid body, by Levenberg's and Marquardt's method from several attitudes. Distances, baselines, relative poses, depths
-and positions are linear in s and t, IMUs in the velocities besides: at an attitude one step is the closed form.
+is minimised over the similarity and the blocks b of unknowns that only these residuals have, with
+cameras and points as a rigid body, by Levenberg's and Marquardt's method from several attitudes.
+Distances, baselines, relative poses, depths and positions are linear in s and t, IMUs in the
+velocities besides: at an attitude one step is the closed form.
 
-Source: Strasdat et al. 2010, "Scale drift-aware large scale monocular SLAM", for the exponential of a similarity."""
+Source: Strasdat et al. 2010, "Scale drift-aware large scale monocular SLAM", for the exponential of
+a similarity."""
 
 from __future__ import annotations
 
@@ -36,21 +39,26 @@ SIMILARITY = 7  # numbers of a similarity: rotation, translation, scale
 
 MOST_ROWS = 1_000  # rows of a residual that are asked, evenly spread among all
 
-MOST_NUMBERS = 150  # of blocks, up to which these are found; residuals with larger ones are not asked
+# of blocks, up to which these are found; residuals with larger ones are not asked
+MOST_NUMBERS = 150
 
 LOOSE = 0.1
-"""Standard deviation (radians, extents of the scene, shares of its scale) up to which rows that the scene is aligned
-with determine a freedom. A flight whose positions lie on a line within their noise knows its roll to 0.2."""
+"""Standard deviation (radians, extents of the scene, shares of its scale) up to which rows that the
+scene is aligned with determine a freedom. A flight whose positions lie on a line within their noise
+knows its roll to 0.2."""
 
-DETERMINED = 1e-13  # smallest information on a freedom that is not rounding, as a share of the largest
+# smallest information on a freedom that is not rounding, as a share of the largest
+DETERMINED = 1e-13
 
 SINGULAR = 1e-9  # smallest eigenvalue of normal equations with a unit diagonal that counts
 
 BETTER = 0.99  # share of the cost at a smaller turn that a larger one must have to be taken
 
-ITERATIONS, ENOUGH = 30, 1e-9  # most steps, and the relative decrease of the cost after which there are no more
+# most steps, and the relative decrease of the cost after which there are no more
+ITERATIONS, ENOUGH = 30, 1e-9
 
-DAMPING, FACTOR = 1e-9, 10.0  # the first damping, as a share of the diagonal, and by what it changes
+# the first damping, as a share of the diagonal, and by what it changes
+DAMPING, FACTOR = 1e-9, 10.0
 
 MOST_SHRUNK = -0.9  # change of the scale in a step, as a share: it stays positive
 
@@ -65,8 +73,9 @@ class Moves(NamedTuple):
 
 
 class Expansion(NamedTuple):
-    """For each of some moves the cost of each residual, its gradient and the matrix of normal equations, by the seven
-    numbers of a similarity about the middle, in radians and extents, and by those of blocks."""
+    """For each of some moves the cost of each residual, its gradient and the matrix of normal
+    equations, by the seven numbers of a similarity about the middle, in radians and extents, and by
+    those of blocks."""
 
     cost: Float[np.ndarray, "n kinds"]
     gradient: Float[np.ndarray, "n kinds numbers"]
@@ -81,14 +90,17 @@ class WholeScene:
     unknowns: Unknowns
     cameras: Float[np.ndarray, "parameters cameras"]
     points: Float[np.ndarray, "3 points"]
-    groups: tuple[Int[np.ndarray, " cameras"], ...]  # the row of each block that each camera has; negative for none
+    # the row of each block that each camera has; negative for none
+    groups: tuple[Int[np.ndarray, " cameras"], ...]
     blocks: tuple[Float[np.ndarray, "_ _"], ...]
     shares: tuple[float, ...]  # rows of each residual over those that are asked
     middle: Float[np.ndarray, "3"]
     extent: float
 
     @classmethod
-    def of(cls, problem: BundleProblem, middle: Float[np.ndarray, "3"], extent: float) -> WholeScene:
+    def of(
+        cls, problem: BundleProblem, middle: Float[np.ndarray, "3"], extent: float
+    ) -> WholeScene:
         """Those of a problem near the origin with a middle and an extent."""
         blocks = tuple(np.asarray(block, np.float64) for block in problem.residuals.blocks)
         asked = sum(block.size for block in blocks) <= MOST_NUMBERS
@@ -107,12 +119,14 @@ class WholeScene:
             extent=extent,
         )
 
-    @numerics(np.float64)  # spinning threads of BLAS made small eigenvalue problems 200 times slower on a busy machine
+    # spinning threads of BLAS made small eigenvalue problems 200 times slower on a busy machine
+    @numerics(np.float64)
     def minimised(
         self, directions: Float[np.ndarray, "7 free"]
     ) -> tuple[Similarity, tuple[Float[np.ndarray, "_ _"], ...], float]:
-        """The similarity in the span of some directions with the least cost, the blocks with it, and its cost as a
-        share of the cost without it. Where nothing is determined it is the identity, and blocks alone are found."""
+        """The similarity in the span of some directions with the least cost, the blocks with it,
+        and its cost as a share of the cost without it. Where nothing is determined it is the
+        identity, and blocks alone are found."""
         free = _moves_freely(directions)
         start = self._started(free)
         begun = self._expanded(start)
@@ -130,7 +144,8 @@ class WholeScene:
         return by, tuple(block[best] for block in moves.blocks), float(costs[best]) / first
 
     def _started(self, free: bool) -> Moves:
-        """The identity, and where the scene moves freely the other 23 rotations of a cube about its middle."""
+        """The identity, and where the scene moves freely the other 23 rotations of a cube about its
+        middle."""
         from scipy.spatial.transform import Rotation  # imported late, as in geometry.py
 
         turns = Rotation.create_group("O").as_matrix()
@@ -140,8 +155,11 @@ class WholeScene:
         blocks = tuple(np.broadcast_to(block, (count, *block.shape)) for block in self.blocks)
         return Moves(np.ones(count), turns, self.middle - turns @ self.middle, blocks)
 
-    def _determined(self, begun: Expansion, directions: Float[np.ndarray, "7 free"]) -> Float[np.ndarray, "7 some"]:
-        """Those directions that rows determine, whatever blocks are, but rows that the scene is aligned with do not."""
+    def _determined(
+        self, begun: Expansion, directions: Float[np.ndarray, "7 free"]
+    ) -> Float[np.ndarray, "7 some"]:
+        """Those directions that rows determine, whatever blocks are, but rows that the scene is
+        aligned with do not."""
         aligned = np.array([kind.rows.aligned for kind in self.kinds])
         known = _about_similarity(begun.normal[0, aligned].sum(axis=0))
         information, vectors = np.linalg.eigh(directions.T @ known @ directions)
@@ -189,8 +207,9 @@ class WholeScene:
         return moves, costs
 
     def _stepped(self, moves: Moves, steps: Float[np.ndarray, "n numbers"], free: bool) -> Moves:
-        """Moves after steps of the scene before it is moved. Where the scene is not `free` they are along paths of the
-        group of similarities, so that what directions leave at its place stays there."""
+        """Moves after steps of the scene before it is moved. Where the scene is not `free` they are
+        along paths of the group of similarities, so that what directions leave at its place stays
+        there."""
         from scipy.spatial.transform import Rotation
 
         steps = steps * np.minimum(1.0, MOST_SHRUNK / np.minimum(steps[:, 6], MOST_SHRUNK))[:, None]
@@ -201,7 +220,10 @@ class WholeScene:
             turn, shift = _along_path(steps[:, :3], growth, shift)
         linear = growth[:, None, None] * turn
         shift = self.middle + shift - linear @ self.middle
-        shift = moves.scale[:, None] * np.einsum("nij,nj->ni", moves.rotation, shift) + moves.translation
+        shift = (
+            moves.scale[:, None] * np.einsum("nij,nj->ni", moves.rotation, shift)
+            + moves.translation
+        )
         blocks = []
         start = SIMILARITY
         for block in moves.blocks:
@@ -211,7 +233,16 @@ class WholeScene:
         return Moves(moves.scale * growth, moves.rotation @ turn, shift, tuple(blocks))
 
     def _expanded(self, moves: Moves) -> Expansion:
-        given = self.kinds, self.unknowns, self.cameras, self.points, self.groups, moves, self.middle, self.extent
+        given = (
+            self.kinds,
+            self.unknowns,
+            self.cameras,
+            self.points,
+            self.groups,
+            moves,
+            self.middle,
+            self.extent,
+        )
         with numerics(np.float64):
             cost, gradient, normal = jax.device_get(program(_expansions, level="quick")(*given))
         shares = np.array(self.shares)
@@ -240,8 +271,8 @@ def _moves_freely(directions: Float[np.ndarray, "7 free"]) -> bool:
 def _along_path(
     turn: Float[np.ndarray, "n 3"], growth: Float[np.ndarray, " n"], shift: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Rotations and translations of exponentials of similarities that grow the scene by `growth`. Source: Strasdat et
-    al. 2010, eq. 16; without a rotation the translation is `shift`."""
+    """Rotations and translations of exponentials of similarities that grow the scene by `growth`.
+    Source: Strasdat et al. 2010, eq. 16; without a rotation the translation is `shift`."""
     from scipy.linalg import expm  # imported late, as in geometry.py
 
     change = growth - 1
@@ -255,9 +286,12 @@ def _along_path(
 
 
 def _solved(
-    normal: Float[np.ndarray, "n k k"], right: Float[np.ndarray, "n k"], damping: Float[np.ndarray, " n"]
+    normal: Float[np.ndarray, "n k k"],
+    right: Float[np.ndarray, "n k"],
+    damping: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n k"]:
-    """Solutions of normal equations whose diagonals are damped by shares of themselves; zero where not determined."""
+    """Solutions of normal equations whose diagonals are damped by shares of themselves; zero where
+    not determined."""
     roots = np.sqrt(np.einsum("nkk->nk", normal))
     inverse = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0)
     values, vectors = np.linalg.eigh(inverse[:, :, None] * normal * inverse[:, None, :])
@@ -287,7 +321,10 @@ def _about_similarity(normal: Float[np.ndarray, "numbers numbers"]) -> Float[np.
     inverse = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0)
     scaled = inverse[:, None] * normal[last, last] * inverse
     mixed = normal[first, last] * inverse
-    return normal[first, first] - mixed @ np.linalg.pinv(scaled, rcond=SINGULAR, hermitian=True) @ mixed.T
+    return (
+        normal[first, first]
+        - mixed @ np.linalg.pinv(scaled, rcond=SINGULAR, hermitian=True) @ mixed.T
+    )
 
 
 def _expansions(
@@ -336,7 +373,11 @@ def _expansions(
         costs, gradients, normals = [], [], []
         for kind, at, by in zip(kinds, residuals(zero), jax.jacfwd(residuals)(zero), strict=True):
             squared = jnp.sum(at * at, axis=0)
-            cost, slope = (squared, jnp.ones_like(squared)) if kind.rows.loss.trivial else kind.rows.loss(squared)
+            cost, slope = (
+                (squared, jnp.ones_like(squared))
+                if kind.rows.loss.trivial
+                else kind.rows.loss(squared)
+            )
             costs.append(0.5 * jnp.sum(cost))
             gradients.append(jnp.einsum("r,kr,krn->n", slope, at, by))
             normals.append(jnp.einsum("r,krm,krn->mn", slope, by, by))

@@ -1,4 +1,5 @@
-"""Real problems of the configuration: those that are on this machine, and the reasons for those that are not."""
+"""Real problems of the configuration: those that are on this machine, and the reasons for those
+that are not."""
 
 from __future__ import annotations
 
@@ -39,7 +40,11 @@ def find(config: FamilyConfig) -> Problems:
     reason = ""
     if not found:
         uses_variable = any(DATA_VARIABLE in entry for entry in config.files)
-        reason = NOT_SET if uses_variable and not os.environ.get(DATA_VARIABLE) else "not run: no file of it is here"
+        reason = (
+            NOT_SET
+            if uses_variable and not os.environ.get(DATA_VARIABLE)
+            else "not run: no file of it is here"
+        )
     missing = tuple(entry for entry, one in paths.items() if not one)
     return Problems(config.name, (*(found if config.whole else ()), *parts), missing, reason)
 
@@ -47,7 +52,9 @@ def find(config: FamilyConfig) -> Problems:
 def bal(config: RealConfig) -> Problems:
     """The BAL problems on this machine and their sub-problems."""
     families = [find(family) for family in config.bal]
-    reasons = [found.reason for found in families] or ["not run: the configuration names no problem of BAL"]
+    reasons = [found.reason for found in families] or [
+        "not run: the configuration names no problem of BAL"
+    ]
     return Problems(
         "BAL",
         tuple(source for found in families for source in found.sources),
@@ -57,8 +64,9 @@ def bal(config: RealConfig) -> Problems:
 
 
 def training_files(config: RealConfig, source: Source) -> tuple[str, tuple[str, ...]]:
-    """What an agent may be trained on that is judged on a problem: the other families of BAL, or the other files of
-    KITTI. Returns the name of what is left out, and the paths of the rest; none for a problem of neither data set."""
+    """What an agent may be trained on that is judged on a problem: the other families of BAL, or
+    the other files of KITTI. Returns the name of what is left out, and the paths of the rest; none
+    for a problem of neither data set."""
     if source.family == config.kitti.name:
         files = _files(config.kitti)
         return label(source.location), tuple(path for path in files if path != source.location)

@@ -1,4 +1,5 @@
-"""Runs the solves and trainings of tables and figures, keeps results on disk, and makes rows of them."""
+"""Runs the solves and trainings of tables and figures, keeps results on disk, and makes rows of
+them."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ from jaxba.typing import InputError
 
 LIMIT = profile.ITERATION_LIMIT
 
-ELSEWHERE, CONSTANT = "-elsewhere", "-constant"  # agents trained on other real problems, and untrained twins
+# agents trained on other real problems, and untrained twins
+ELSEWHERE, CONSTANT = "-elsewhere", "-constant"
 TEST = "test"  # name of the scenes of the tables in records
 SMALL = "small"  # family of the small random scenes
 
@@ -44,17 +46,20 @@ Built: TypeAlias = tuple[DampingPolicy, SolveOptions]
 
 @dataclass(frozen=True)
 class Method:
-    """The solver of a table row: a policy, perhaps with several training runs, and the options of the step.
+    """The solver of a table row: a policy, perhaps with several training runs, and the options of
+    the step.
 
-    `build` gets the number of a training run, and a real problem (None: the scenes of the tables); it returns None if
-    there is no policy for it. Rules ignore both. It may train it, so it is called only if something has to be run. A
-    policy has collapsed if it does the same in every state in the end."""
+    `build` gets the number of a training run, and a real problem (None: the scenes of the tables);
+    it returns None if there is no policy for it. Rules ignore both. It may train it, so it is
+    called only if something has to be run. A policy has collapsed if it does the same in every
+    state in the end."""
 
     name: str  # in records
     build: Callable[[int, Source | None], Built | None]  # policy and options of a training run
     seeds: int = 0  # number of training runs; 0 for a rule
     peer: SolverName | None = None  # another library that solves real problems, in place of `build`
-    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False  # whether most policies do so
+    # whether most policies do so
+    collapsed: Callable[[Sequence[Source | None]], bool] = lambda _: False
 
     @property
     def numbers(self) -> range:
@@ -73,7 +78,9 @@ def method_named(name: str) -> Method:
 
     def build(*_: Any) -> Built:
         policy, options = parsed.build()
-        return policy, replace(options, linear_solver=cast(LinearSolverChoice, linear if slash else "auto"))
+        return policy, replace(
+            options, linear_solver=cast(LinearSolverChoice, linear if slash else "auto")
+        )
 
     return Method(name, build, 0, parsed if parsed.peer else None)
 
@@ -81,21 +88,30 @@ def method_named(name: str) -> Method:
 class Runner:
     """A reproduction run in a folder. Nothing is run whose result is in the folder."""
 
-    def __init__(self, config: PaperConfig, folder: Path, report: Callable[[str], None] = lambda _: None) -> None:
-        """Reads the results that the folder, which must exist, has. `report` is called with a line of text when
-        something starts. Raises ProblemError: a file of results is damaged."""
+    def __init__(
+        self, config: PaperConfig, folder: Path, report: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Reads the results that the folder, which must exist, has. `report` is called with a line
+        of text when something starts. Raises ProblemError: a file of results is damaged."""
         self.config, self.folder, self.report = config, folder, report
         self.store = Store(folder)
         self.done = 0  # solves, plays and trainings of this process
         self._read: tuple[Source, BundleProblem] | None = None
 
     def agent(
-        self, kind: Agent, linear: LinearSolverChoice = "auto", method: str = "lm", *, twin: bool = False
+        self,
+        kind: Agent,
+        linear: LinearSolverChoice = "auto",
+        method: str = "lm",
+        *,
+        twin: bool = False,
     ) -> Method:
-        """The method with an agent, which is trained on synthetic scenes when it is first built; or its twin without
-        learning, the best constant action on its training scenes."""
+        """The method with an agent, which is trained on synthetic scenes when it is first built; or
+        its twin without learning, the best constant action on its training scenes."""
         if method != "lm":
-            kind = replace(kind, name=f"{method}+{kind.name}", overrides=(*kind.overrides, f"method={method}"))
+            kind = replace(
+                kind, name=f"{method}+{kind.name}", overrides=(*kind.overrides, f"method={method}")
+            )
         return self._method(kind.name, lambda _: kind, method, linear=linear, twin=twin)
 
     def elsewhere(self, kind: Agent, method: str = "lm", *, twin: bool = False) -> Method:
@@ -126,7 +142,11 @@ class Runner:
 
         def collapsed(of: Sequence[Source | None]) -> bool:
             named = {agent.name: agent for source in of if (agent := find(source))}
-            found = [one for agent in named.values() for one in agents.collapsed(self.config, agent, self.folder)]
+            found = [
+                one
+                for agent in named.values()
+                for one in agents.collapsed(self.config, agent, self.folder)
+            ]
             return not twin and 2 * sum(found) > len(found)
 
         name += CONSTANT * twin + f"/{linear}" * (linear != "auto")
@@ -172,7 +192,10 @@ class Runner:
             started = time.perf_counter()
             found = play(settings.bank.kind, bank, policy, options, LIMIT)
             best = np.asarray(bank.best_cost)
-            first = [row[: min(SCHEDULE, count)] for row, count in zip(found.dampings, found.iterations, strict=True)]
+            first = [
+                row[: min(SCHEDULE, count)]
+                for row, count in zip(found.dampings, found.iterations, strict=True)
+            ]
             self.store.add_play(
                 Play(
                     scenes=TEST,
@@ -188,9 +211,16 @@ class Runner:
             )
             self.done += 1
 
-    def solve(self, sources: Iterable[Source], methods: Sequence[Method], limit: int = LIMIT, repeats: int = 0) -> None:
-        """Solves problems with methods, except for those whose results the folder has. A problem that cannot be read is
-        reported and skipped. `limit` of linear solves and `repeats` are the configuration's if 0."""
+    def solve(
+        self,
+        sources: Iterable[Source],
+        methods: Sequence[Method],
+        limit: int = LIMIT,
+        repeats: int = 0,
+    ) -> None:
+        """Solves problems with methods, except for those whose results the folder has. A problem
+        that cannot be read is reported and skipped. `limit` of linear solves and `repeats` are the
+        configuration's if 0."""
         for source in sources:
             for method in methods:
                 for seed in method.numbers:
@@ -213,17 +243,24 @@ class Runner:
         self.report(f"{source.name} by {method.label(seed)}")
         if built is None:
             assert method.peer
-            record = run_solver(problem, source, method.peer, repeat, RunSettings(max_iterations=limit))
+            record = run_solver(
+                problem, source, method.peer, repeat, RunSettings(max_iterations=limit)
+            )
         else:
             policy, options = built
             options = replace(options, max_iterations=limit, compilation="full")
-            if source.family in (self.config.real.kitti.name, SMALL):  # poses and points are unknown, as in the paper
+            # poses and points are unknown, as in the paper
+            if source.family in (self.config.real.kitti.name, SMALL):
                 options = replace(options, intrinsics="fixed")
             if source.family == SMALL:
                 options = replace(options, linear_solver="explicit")
             steps: list[IterationRecord] = []
             solution = solve(problem, policy, options, callback=lambda step: steps.append(step))
-            known: Any = {"name": source.name, "family": source.family, "solver": SolverName("ceres")}
+            known: Any = {
+                "name": source.name,
+                "family": source.family,
+                "solver": SolverName("ceres"),
+            }
             record = record_of(solution, steps, repeat=repeat, **known)
         self.store.add_solve(replace(record, solver=method.label(seed)))
         self.done += 1
@@ -246,12 +283,17 @@ class Runner:
                 found[seed] = results.of_records(records, best)
         return self._row(method, found, sources)
 
-    def _row(self, method: Method, found: dict[int, list[results.Outcome]], of: Sequence[Source | None]) -> Row:
+    def _row(
+        self, method: Method, found: dict[int, list[results.Outcome]], of: Sequence[Source | None]
+    ) -> Row:
         row = results.row_of(method.name, found, method.seeds > 0)
         return row._replace(collapsed=bool(found) and method.collapsed(of))
 
-    def records_on(self, sources: Iterable[Source], methods: Iterable[Method], seed: int = 0) -> list[Record]:
-        """Records of solves with one training run of each method, with `Method.name` as the solver."""
+    def records_on(
+        self, sources: Iterable[Source], methods: Iterable[Method], seed: int = 0
+    ) -> list[Record]:
+        """Records of solves with one training run of each method, with `Method.name` as the
+        solver."""
         labels = {method.label(seed): method.name for method in methods}
         found = self.store.solves_of([source.name for source in sources], list(labels))
         return [replace(record, solver=labels[record.solver]) for record in found]

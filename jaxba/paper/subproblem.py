@@ -14,19 +14,30 @@ from jaxba.problem.preprocess import MIN_TRACK
 
 
 def sub_problem(
-    problem: BundleProblem, cameras: Sequence[int] | Int[np.ndarray, " kept"], points: Sequence[int] | None = None
+    problem: BundleProblem,
+    cameras: Sequence[int] | Int[np.ndarray, " kept"],
+    points: Sequence[int] | None = None,
 ) -> BundleProblem:
-    """The problem restricted to some cameras and to those points, of the given ones or of all, that at least two of
-    them observe, in the same order. Raises ProblemError: an index is out of range, or no point is left."""
+    """The problem restricted to some cameras and to those points, of the given ones or of all, that
+    at least two of them observe, in the same order. Raises ProblemError: an index is out of range,
+    or no point is left."""
     kept = np.unique(np.asarray(cameras, int))
-    allowed = np.arange(problem.num_points) if points is None else np.unique(np.asarray(points, int))
-    for name, numbers, count in (("camera", kept, problem.num_cameras), ("point", allowed, problem.num_points)):
+    allowed = (
+        np.arange(problem.num_points) if points is None else np.unique(np.asarray(points, int))
+    )
+    for name, numbers, count in (
+        ("camera", kept, problem.num_cameras),
+        ("point", allowed, problem.num_points),
+    ):
         if numbers.size and not 0 <= numbers[0] <= numbers[-1] < count:
-            raise ProblemError(f"there is no {name} {numbers[0] if numbers[0] < 0 else numbers[-1]} among {count}")
+            raise ProblemError(
+                f"there is no {name} {numbers[0] if numbers[0] < 0 else numbers[-1]} among {count}"
+            )
     camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     keep = np.isin(camera_index, kept) & np.isin(point_index, allowed)
     pairs = np.unique(np.stack([point_index[keep], camera_index[keep]]), axis=1)
-    tracks = np.bincount(pairs[0], minlength=problem.num_points)  # of distinct cameras: one may observe a point twice
+    # of distinct cameras: one may observe a point twice
+    tracks = np.bincount(pairs[0], minlength=problem.num_points)
     keep &= tracks[point_index] >= MIN_TRACK
     if not keep.any():
         raise ProblemError(f"no point is seen by two of these {len(kept)} cameras")
@@ -36,12 +47,15 @@ def sub_problem(
 def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"]:
     """Cameras with many common points, chosen greedily.
 
-    The first is the camera that observes most points. The next shares most points with those chosen; of equals, the
-    first. Returns sorted indices. Raises ProblemError: the problem has fewer cameras."""
+    The first is the camera that observes most points. The next shares most points with those
+    chosen; of equals, the first. Returns sorted indices. Raises ProblemError: the problem has fewer
+    cameras."""
     if not 1 <= count <= problem.num_cameras:
         raise ProblemError(f"cannot take {count} of {problem.num_cameras} cameras")
     pairs = np.asarray(problem.camera_index), np.asarray(problem.point_index)
-    seen = csr_matrix((np.ones(len(pairs[0]), np.int64), pairs), (problem.num_cameras, problem.num_points))
+    seen = csr_matrix(
+        (np.ones(len(pairs[0]), np.int64), pairs), (problem.num_cameras, problem.num_points)
+    )
     seen.data[:] = 1  # a camera may observe a point twice
     chosen = [int(np.argmax(seen.getnnz(axis=1)))]
     shared, covered = np.zeros(problem.num_cameras, int), np.zeros(problem.num_points, bool)

@@ -1,10 +1,12 @@
 """The paper's Zero-net: a network that chooses lambda to minimise the cost after the next step.
 
-Its input is the same history as the agent's (the last states, actions and rewards), but it is trained greedily: the
-gradient is that of the cost after one step, through the differentiable `lm_step`. It is trained when a table needs it.
+Its input is the same history as the agent's (the last states, actions and rewards), but it is
+trained greedily: the gradient is that of the cost after one step, through the differentiable
+`lm_step`. It is trained when a table needs it.
 
-The next cost depends on the network through lambda only, so the gradient is a product of two factors. The derivative of
-the cost by the action is in forward mode, a number per scene: a failed factorisation spoils only one."""
+The next cost depends on the network through lambda only, so the gradient is a product of two
+factors. The derivative of the cost by the action is in forward mode, a number per scene: a failed
+factorisation spoils only one."""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ from jaxba.runtime.jit import jit
 from jaxba.training import checkpoint
 from jaxba.typing import register_pytree
 
-MAX_SLOPE = 1.0  # of log10(cost) by the action, for each scene; that of a step of non-finite cost is its negative
+# of log10(cost) by the action, for each scene; that of a step of non-finite cost is its negative
+MAX_SLOPE = 1.0
 
 _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
 
@@ -61,13 +64,17 @@ class ZeroNet(AgentPolicy):
 
 
 def inputs(memory: Memory) -> Float[Array, " features"]:
-    """Input of the network: last errors, actions as log10(lambda), rewards (-1 an iteration, 0 where none was yet)."""
+    """Input of the network: last errors, actions as log10(lambda), rewards (-1 an iteration, 0
+    where none was yet)."""
     steps = memory.steps
-    return jnp.concatenate([memory.errors, steps[:, _DAMPING], -steps[:, _PRESENT]]).astype(jnp.float32)
+    return jnp.concatenate([memory.errors, steps[:, _DAMPING], -steps[:, _PRESENT]]).astype(
+        jnp.float32
+    )
 
 
 def initial_network(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> ZeroNet:
-    """An untrained network: He initialisation for hidden layers, nearly zero for the last, as for the agent."""
+    """An untrained network: He initialisation for hidden layers, nearly zero for the last, as for
+    the agent."""
     sizes = [3 * agent.history, *[config.width] * config.layers, 1]
     layers = []
     for k, (rows, columns) in enumerate(pairwise(sizes)):
@@ -80,8 +87,8 @@ def initial_network(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> Ze
 def slope_of_next_cost(
     game: Game, episode: Episode, action: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Episode, StepInfo]:
-    """Makes one step, rejected or not. Returns log10 of the candidate's cost over the current cost, its derivative by
-    the action, the episode after the step, and the step."""
+    """Makes one step, rejected or not. Returns log10 of the candidate's cost over the current cost,
+    its derivative by the action, the episode after the step, and the step."""
 
     def play(action: Array) -> tuple[Array, tuple[Episode, StepInfo]]:
         after, step = game.iterate(game.bank, episode, action[None])
@@ -92,10 +99,12 @@ def slope_of_next_cost(
     return change, slope, after, step
 
 
-def train(config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array) -> tuple[ZeroNet, np.ndarray]:
-    """Trains a network on the scenes of a game, whose rewards are not used. `config` has the sizes of
-    the network and of the training, `agent` the length of the history and the range of lambda. Returns the network, and
-    for each update the mean of log10(next cost / current cost)."""
+def train(
+    config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array
+) -> tuple[ZeroNet, np.ndarray]:
+    """Trains a network on the scenes of a game, whose rewards are not used. `config` has the sizes
+    of the network and of the training, `agent` the length of the history and the range of lambda.
+    Returns the network, and for each update the mean of log10(next cost / current cost)."""
     start, play = jax.random.split(key)
     net = initial_network(config, agent, start)
     layers, means = _train(config, game, net, play)
@@ -122,7 +131,9 @@ def _train(
             step_one = lambda episode, action: slope_of_next_cost(game, episode, action)
             change, slope, after, step = step_groups(step_one, episodes, lax.stop_gradient(actions))
             known = jnp.isfinite(change) & jnp.isfinite(slope)
-            slope = jnp.clip(jnp.where(known, slope, -MAX_SLOPE), -MAX_SLOPE, MAX_SLOPE).astype(jnp.float32)
+            slope = jnp.clip(jnp.where(known, slope, -MAX_SLOPE), -MAX_SLOPE, MAX_SLOPE).astype(
+                jnp.float32
+            )
             counted = jnp.sum(jnp.where(known, change, 0.0)) / jnp.maximum(jnp.sum(known), 1)
             return jnp.mean(lax.stop_gradient(slope) * actions), (after, step, counted)
 
@@ -152,4 +163,6 @@ def save(path: Path, net: ZeroNet) -> None:
 def restore(path: Path, config: ZeroNetConfig, agent: AgentConfig) -> ZeroNet:
     """Reads the network that `save` wrote."""
     like = jax.eval_shape(lambda: initial_network(config, agent, jax.random.key(0)).layers)
-    return ZeroNet(jax.tree.map(np.asarray, checkpoint.unpack(checkpoint.read_arrays(path), like)), agent)
+    return ZeroNet(
+        jax.tree.map(np.asarray, checkpoint.unpack(checkpoint.read_arrays(path), like)), agent
+    )

@@ -1,4 +1,5 @@
-"""Other libraries that `jaxba-bench` compares with: optional dependencies, imported only where they are used."""
+"""Other libraries that `jaxba-bench` compares with: optional dependencies, imported only where they
+are used."""
 
 from __future__ import annotations
 
@@ -18,4 +19,6 @@ def require(solver: SolverName) -> None:
     extra, packages = NEEDS[solver.peer.partition(":")[0]]
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
-        raise InputError(f"{str(solver)!r} needs {' and '.join(missing)}: pip install jaxba[{extra}]")
+        raise InputError(
+            f"{str(solver)!r} needs {' and '.join(missing)}: pip install jaxba[{extra}]"
+        )

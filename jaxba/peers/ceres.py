@@ -1,7 +1,7 @@
 """Solves with Ceres under its own trust-region rule. Needs the extra `ceres`.
 
-The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function ignores, are counted
-(see `colmap.py`)."""
+The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function
+ignores, are counted (see `colmap.py`)."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ from jaxba.solver.solve import Solution
 _log = logging.getLogger(__name__)
 
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
-"""Ceres' linear solver of a mode; the iterative one with SCHUR_JACOBI. After it `INNER` means inner iterations."""
+"""Ceres' linear solver of a mode; the iterative one with SCHUR_JACOBI. After it `INNER` means inner
+iterations."""
 
-FORCING = 0.1  # forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`
+# forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`
+FORCING = 0.1
 
 ENDS = {
     "Function tolerance": Termination.COST,
@@ -38,19 +40,24 @@ ENDS = {
     "Maximum number of iterations": Termination.MAX_ITERATIONS,
     "Minimum trust region radius": Termination.DAMPING_LIMIT,
 }
-"""Reason to stop by the beginning of Ceres' message. Any other is a failure, after five invalid steps in a row."""
+"""Reason to stop by the beginning of Ceres' message. Any other is a failure, after five invalid
+steps in a row."""
 
 ENDS_WITHOUT_STEP = (Termination.COST, Termination.STEP)
-"""Convergence tests that Ceres makes before it accepts a step, so that the last step is computed but not taken."""
+"""Convergence tests that Ceres makes before it accepts a step, so that the last step is computed
+but not taken."""
 
 Callback = Callable[[IterationRecord], Any]
 
 
 def solver_options(mode: str, threads: int) -> Any:
-    """Ceres' default options with the linear solver of a mode, inner iterations if the mode has them, and no output."""
+    """Ceres' default options with the linear solver of a mode, inner iterations if the mode has
+    them, and no output."""
     options = pyceres.SolverOptions()
     options.use_inner_iterations = mode.endswith(INNER)
-    options.linear_solver_type = getattr(pyceres.LinearSolverType, LINEAR_SOLVERS[mode.removesuffix(INNER)])
+    options.linear_solver_type = getattr(
+        pyceres.LinearSolverType, LINEAR_SOLVERS[mode.removesuffix(INNER)]
+    )
     options.preconditioner_type = pyceres.PreconditionerType.SCHUR_JACOBI
     options.eta = FORCING
     options.num_threads = threads
@@ -62,7 +69,8 @@ class Run:
     """A solve in progress: the Ceres problem, the clock and the recorded iterations."""
 
     def __init__(self, problem: BundleProblem, callback: Callback | None) -> None:
-        """Builds Ceres' problem. Raises ProblemError: a non-finite initial cost, covariances or shared lenses."""
+        """Builds Ceres' problem. Raises ProblemError: a non-finite initial cost, covariances or
+        shared lenses."""
         self.initial_cost = geometry.cost(problem)
         if not np.isfinite(self.initial_cost):
             raise ProblemError(explain_start(problem))
@@ -75,7 +83,10 @@ class Run:
         self.paused = 0.0
         self.total_s = 0.0
         if behind := int(self.colmap.in_python.sum()):
-            _log.warning("%d observations of points behind their camera: Python evaluates them for Ceres", behind)
+            _log.warning(
+                "%d observations of points behind their camera: Python evaluates them for Ceres",
+                behind,
+            )
 
     def start(self) -> None:
         """Starts the clock of `total_s`."""
@@ -83,7 +94,8 @@ class Run:
         self.paused = 0.0
 
     def newly_behind(self) -> Bool[np.ndarray, " observations"]:
-        """Observations whose point moved behind its camera: COLMAP ignores them. Their time is not counted."""
+        """Observations whose point moved behind its camera: COLMAP ignores them. Their time is not
+        counted."""
         now = time.perf_counter()
         behind = geometry.depths(self.colmap.bundle()) < SMALLEST_DEPTH
         self.paused += time.perf_counter() - now
@@ -92,18 +104,27 @@ class Run:
     def count_behind(self, behind: Bool[np.ndarray, " observations"]) -> None:
         """Counts observations of points behind their camera from here on."""
         number = self.colmap.count_behind(behind)
-        _log.info("%d observations of points that went behind their camera: Python evaluates them from here on", number)
+        _log.info(
+            "%d observations of points that went behind their camera: Python evaluates them from "
+            "here on",
+            number,
+        )
 
     def record(self, step: StepInfo) -> bool:
         """Records an iteration at the parameters after it, and calls the callback.
 
-        Times of jaxba's cost and of the callback are not counted. Returns whether the callback asked to stop."""
+        Times of jaxba's cost and of the callback are not counted. Returns whether the callback
+        asked to stop."""
         now = time.perf_counter()
         self.total_s = now - self.started - self.paused
         if step.accepted:
             self.cost = geometry.cost(self.colmap.bundle())
         self.steps.append(step._replace(cost=self.cost))
-        stop = self.callback(IterationRecord(len(self.steps), self.total_s, self.steps[-1])) if self.callback else False
+        stop = (
+            self.callback(IterationRecord(len(self.steps), self.total_s, self.steps[-1]))
+            if self.callback
+            else False
+        )
         self.paused += time.perf_counter() - now
         return bool(stop)
 
@@ -126,18 +147,26 @@ class Run:
 
 
 def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
-    """The record of a rejected step. Fields that are not given in `known` are NaN or neutral values."""
+    """The record of a rejected step. Fields that are not given in `known` are NaN or neutral
+    values."""
     fields: dict[str, Any] = dict.fromkeys(StepInfo._fields, np.nan)
-    fields |= {"cost": cost, "previous_cost": cost, "damping": damping, "forcing": 0.0, "step_fraction": 1.0}
+    fields |= {
+        "cost": cost,
+        "previous_cost": cost,
+        "damping": damping,
+        "forcing": 0.0,
+        "step_fraction": 1.0,
+    }
     fields |= dict.fromkeys(("accepted", "weightless"), False)
     fields |= dict.fromkeys(("cg_iterations", "repairs"), 0)
     return StepInfo(**{**fields, **known})
 
 
 def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str) -> StepInfo:
-    """Converts Ceres' summaries of an iteration and of the one before it, which has the gradient at the start of the
-    step, into a `StepInfo`. Of a rejected step they have the candidate's cost only, so the last accepted one is given,
-    and lambda. Only the iterative mode counts conjugate gradients."""
+    """Converts Ceres' summaries of an iteration and of the one before it, which has the gradient at
+    the start of the step, into a `StepInfo`. Of a rejected step they have the candidate's cost
+    only, so the last accepted one is given, and lambda. Only the iterative mode counts conjugate
+    gradients."""
     fields: dict[str, Any] = {
         "previous_cost": previous_cost,
         "gradient_max": before.gradient_max_norm,
@@ -156,7 +185,8 @@ def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: s
 
 
 class _RecordingCallback(pyceres.IterationCallback):
-    """Records every iteration of Ceres. Stops Ceres when an accepted step has moved a point behind its camera."""
+    """Records every iteration of Ceres. Stops Ceres when an accepted step has moved a point behind
+    its camera."""
 
     def __init__(self, run: Run, mode: str) -> None:
         super().__init__()
@@ -199,18 +229,22 @@ def solve_by_ceres(
     threads: int = 1,
     callback: Callback | None = None,
 ) -> Solution:
-    """Solves with Ceres under its own trust-region rule and convergence tests, with jaxba's tolerances.
+    """Solves with Ceres under its own trust-region rule and convergence tests, with jaxba's
+    tolerances.
 
-    Ceres tests for a small decrease first: that last solve counts as a rejected step with gain ratio 0.
+    Ceres tests for a small decrease first: that last solve counts as a rejected step with gain
+    ratio 0.
 
-    COLMAP gives a point behind its camera a residual of zero. If an accepted step moves a point there, the step is
-    undone and repeated from the same radius with that observation counted. That counts as one iteration.
+    COLMAP gives a point behind its camera a residual of zero. If an accepted step moves a point
+    there, the step is undone and repeated from the same radius with that observation counted. That
+    counts as one iteration.
 
-    In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead of angles).
-    `parameter_norm` and `damping_fraction` are NaN. `mode` is a key of `LINEAR_SOLVERS`, followed by `INNER` for Ceres'
-    inner iterations. The target cost and the limit of time are ignored. `callback` is called after every iteration; a
-    true return value stops the solve. Raises ProblemError: the initial cost is not finite, or the problem has
-    covariances or shared lenses."""
+    In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead
+    of angles). `parameter_norm` and `damping_fraction` are NaN. `mode` is a key of
+    `LINEAR_SOLVERS`, followed by `INNER` for Ceres' inner iterations. The target cost and the limit
+    of time are ignored. `callback` is called after every iteration; a true return value stops the
+    solve. Raises ProblemError: the initial cost is not finite, or the problem has covariances or
+    shared lenses."""
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
     options = solver_options(mode, threads)
@@ -232,11 +266,16 @@ def solve_by_ceres(
     if summary.message.startswith("User callback"):
         end = Termination.STOPPED
     else:
-        end = next((end for words, end in ENDS.items() if summary.message.startswith(words)), Termination.STALLED)
+        end = next(
+            (end for words, end in ENDS.items() if summary.message.startswith(words)),
+            Termination.STALLED,
+        )
     if end == Termination.STALLED:
         _log.warning("Ceres gave up: %s", summary.message)
     if end in ENDS_WITHOUT_STEP:
         gradient = recorder.last.gradient_max_norm
-        run.record(step_info(recorder.cost, recorder.damping, gradient_max=gradient, gain_ratio=0.0))
+        run.record(
+            step_info(recorder.cost, recorder.damping, gradient_max=gradient, gain_ratio=0.0)
+        )
     run.total_s = time.perf_counter() - run.started - run.paused
     return run.solution(end, mode)

@@ -1,1 +1,2 @@
-"""The bundle adjustment problem: cameras, points, observations, losses, options and preprocessing."""
+"""The bundle adjustment problem: cameras, points, observations, losses, options and
+preprocessing."""

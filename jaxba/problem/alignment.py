@@ -15,32 +15,37 @@ from jaxba.problem.misfit import BENDS, MISFIT, extent_of, off_by, wrong_places,
 from jaxba.problem.similarity import Similarity, along_line, transformed, umeyama
 
 STARTS, ROUNDS, KEPT, COMPARED = 20, 10, 0.5, 2 / 3
-"""Starts of a robust alignment, the rounds of each, the share of the images that these keep, and that by which ends are
-compared: it stands a third of the positions wrong, of which all starts have one in 1 of 300."""
+"""Starts of a robust alignment, the rounds of each, the share of the images that these keep, and
+that by which ends are compared: it stands a third of the positions wrong, of which all starts have
+one in 1 of 300."""
 
 SIGNIFICANT = 3.0
-"""Standard deviations by which positions must spread in a direction before they say anything about scale or rotation:
-three images on a line with this spread across it determine the roll about it to some 0.2 radians, 30 to 0.06."""
+"""Standard deviations by which positions must spread in a direction before they say anything about
+scale or rotation: three images on a line with this spread across it determine the roll about it to
+some 0.2 radians, 30 to 0.06."""
 
 MOST = 0.75  # share of the images that must fit: it is noted if fewer do
 
 DOUBTFUL = 2.0  # distance, over that of noise, from which other axes or units are tried
 
 BETTER, EXPLAINED, LEAST_IMAGES = 0.3, 0.1, 5
-"""Other axes or units are taken for the true ones if they leave this share of the misfit, and no more than this share
-of the extent, with so many images: of four, half fit too well by chance, so that all must fit."""
+"""Other axes or units are taken for the true ones if they leave this share of the misfit, and no
+more than this share of the extent, with so many images: of four, half fit too well by chance, so
+that all must fit."""
 
 MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
 """Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
 
 LARGEST_AREA, EARTH = 1.0, 6.371e6
-"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent. Radius, metres."""
+"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent.
+Radius, metres."""
 
 _MIRRORED = np.outer([-1, 1, 1], [-1, 1, 1])  # signs of a covariance once x is mirrored
 
 NOT_DETERMINED = (
     "the positions are at one place within their noise: the alignment only moves the scene",
-    "the positions lie on a line within their noise: the alignment does not turn the scene about it",
+    "the positions lie on a line within their noise: the alignment does not turn the scene about "
+    "it",
 )
 """Notes, by the number of directions in which the positions spread."""
 
@@ -51,10 +56,11 @@ def aligned(
     covariances: Float[np.ndarray, "n 3 3"],
     images: np.ndarray,
 ) -> BundleProblem:
-    """The problem moved, turned and scaled so that the centres of images are near the given positions.
+    """The problem moved, turned and scaled so that the centres of images are near the given
+    positions.
 
-    Other `ProblemWarning`s than those of `alignment` say which positions do not fit, or that they do not fit together.
-    Raises ProblemError: as that does."""
+    Other `ProblemWarning`s than those of `alignment` say which positions do not fit, or that they
+    do not fit together. Raises ProblemError: as that does."""
     if not len(images):
         return problem
     centers = geometry.camera_centers(problem.cameras)[images]
@@ -63,7 +69,9 @@ def aligned(
     def name(at: int) -> str:
         return part_name(problem.labels, "image", int(images[at]))
 
-    for text in misfit_texts(name, "images", best.points(centers) - positions, positions, covariances, chi):
+    for text in misfit_texts(
+        name, "images", best.points(centers) - positions, positions, covariances, chi
+    ):
         _note(text)
     return transformed(problem, best)
 
@@ -76,7 +84,8 @@ def misfit_texts(
     covariances: Float[np.ndarray, "n 3 3"],
     chi: float,
 ) -> list[str]:
-    """Which measured positions the aligned scene does not have, or that many do not fit; none if they do.
+    """Which measured positions the aligned scene does not have, or that many do not fit; none if
+    they do.
 
     Args:
         name: what a position is of.
@@ -91,18 +100,26 @@ def misfit_texts(
     if chi > MISFIT and most > BENDS * extent_of(positions):
         farthest = wrong if len(wrong) else np.argsort(-distance)
         return [
-            f"a quarter of the {kind} of the aligned scene are {most:.3g} or more from their positions, {chi:.3g} "
-            f"times what the standard deviations explain: {wrong_text(name, farthest, away, covariances)}"
+            f"a quarter of the {kind} of the aligned scene are {most:.3g} or more from their "
+            f"positions, {chi:.3g} "
+            "times what the standard deviations explain: "
+            f"{wrong_text(name, farthest, away, covariances)}"
         ]
     if len(wrong):
-        return [f"measured positions do not fit the others: {wrong_text(name, wrong, away, covariances)}"]
+        return [
+            "measured positions do not fit the others: "
+            f"{wrong_text(name, wrong, away, covariances)}"
+        ]
     return []
 
 
 def check_axes(
-    places: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    places: Float[np.ndarray, "n 3"],
+    positions: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
 ) -> bool:
-    """Whether measured positions fit places of a scene as well if an axis is mirrored, as those in a plane do.
+    """Whether measured positions fit places of a scene as well if an axis is mirrored, as those in
+    a plane do.
 
     Raises ProblemError: they fit well with other axes or units only."""
     best, _ = _robust_fit(places, positions, covariances)
@@ -117,21 +134,29 @@ def check_axes(
 
 
 def alignment(
-    centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    centers: Float[np.ndarray, "n 3"],
+    positions: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
 ) -> tuple[Similarity, float]:
-    """The similarity from places of a scene to measured positions, and the misfit over that of noise.
+    """The similarity from places of a scene to measured positions, and the misfit over that of
+    noise.
 
-    What the positions do not determine beyond their noise stays as it was, with a `ProblemWarning`: the rotation about
-    a line, or all but the translation.
+    What the positions do not determine beyond their noise stays as it was, with a `ProblemWarning`:
+    the rotation about a line, or all but the translation.
 
-    Source: `umeyama` in rounds that each keep the nearer half of the places (least trimmed squares; Rousseeuw 1984).
+    Source: `umeyama` in rounds that each keep the nearer half of the places (least trimmed squares;
+    Rousseeuw 1984).
     Raises ProblemError: the positions are latitude and longitude, or mirrored; or too far apart."""
     with np.errstate(over="ignore"):
         if not np.isfinite([np.sum(centers**2), np.sum(positions**2)]).all():
-            raise ProblemError("the scene cannot be aligned: positions are too far apart to be squared")
+            raise ProblemError(
+                "the scene cannot be aligned: positions are too far apart to be squared"
+            )
     best, rank = _robust_fit(centers, positions, covariances)
     left_over = 3 * len(centers) - (3, 6, 7)[rank]
-    chi = float(np.quantile(_distances(best, centers, positions, covariances), MOST)) / UPPER_QUARTER
+    chi = (
+        float(np.quantile(_distances(best, centers, positions, covariances), MOST)) / UPPER_QUARTER
+    )
     chi = chi * np.sqrt(3 * len(centers) / left_over) if left_over else 0.0
     if chi > DOUBTFUL or _rank(positions[:, :2], covariances[:, :2, :2]) == 0:
         _refuse_other_axes(centers, positions)
@@ -144,8 +169,11 @@ def _note(text: str, stacklevel: int = 4) -> None:
     warnings.warn(text, ProblemWarning, stacklevel=stacklevel)
 
 
-def _robust_fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) -> tuple[Similarity, int]:
-    """The similarity that fits most images, and in how many directions, at most two, positions and centres spread."""
+def _robust_fit(
+    centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray
+) -> tuple[Similarity, int]:
+    """The similarity that fits most images, and in how many directions, at most two, positions and
+    centres spread."""
     rng, best, least = np.random.default_rng(0), None, np.inf
     count = len(centers)
     for start in range(STARTS):
@@ -155,21 +183,33 @@ def _robust_fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndar
             distance = _distances(fit, centers, positions, covariances)
             kept = np.argsort(distance)[: max(3, int(np.ceil(KEPT * count)))]
         nearest = float(np.sort(distance)[: int(np.ceil(COMPARED * count))].sum())
-        if best is None or nearest < least:  # of more than half: that may lie on a line, and others not
+        # of more than half: that may lie on a line, and others not
+        if best is None or nearest < least:
             best, least = distance, nearest
     assert best is not None
-    error = max(1.0, float(np.median(best)) / MEDIAN)  # in standard deviations: the scene has its own
+    # in standard deviations: the scene has its own
+    error = max(1.0, float(np.median(best)) / MEDIAN)
     near = best <= NEARLY_ALL * error
-    return _fit(centers[near], positions[near], max(1.0, error / SIGNIFICANT) ** 2 * covariances[near])
+    return _fit(
+        centers[near], positions[near], max(1.0, error / SIGNIFICANT) ** 2 * covariances[near]
+    )
 
 
-def _fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) -> tuple[Similarity, int]:
+def _fit(
+    centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray
+) -> tuple[Similarity, int]:
     """The similarity as far as it is determined, and the rank as `_robust_fit` says it."""
     weights = _weights(covariances)
     rank = min(2, _rank(positions, covariances))
     if rank:
-        spread = np.linalg.svd(np.sqrt(weights)[:, None] * (centers - weights @ centers), compute_uv=False)
-        scale = np.sqrt(weights @ np.sum((positions - weights @ positions) ** 2, axis=1) / max(spread @ spread, 1e-300))
+        spread = np.linalg.svd(
+            np.sqrt(weights)[:, None] * (centers - weights @ centers), compute_uv=False
+        )
+        scale = np.sqrt(
+            weights
+            @ np.sum((positions - weights @ positions) ** 2, axis=1)
+            / max(spread @ spread, 1e-300)
+        )
         noise = np.sqrt(np.linalg.eigvalsh(np.einsum("n,nij->ij", weights, covariances))[0])
         rounding = 1e-12 * np.abs(centers).max()
         rank = min(rank, int(np.sum((scale * spread > SIGNIFICANT * noise) & (spread > rounding))))
@@ -187,7 +227,11 @@ def _rank(positions: np.ndarray, covariances: np.ndarray) -> int:
     """In how many directions positions spread beyond their noise."""
     weights = _weights(covariances)
     values, vectors = np.linalg.eigh(np.einsum("n,nij->ij", weights, covariances))
-    white = (positions - weights @ positions) @ vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    white = (
+        (positions - weights @ positions)
+        @ vectors
+        / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    )
     white *= np.sqrt(weights)[:, None]
     return int(np.sum(np.linalg.svd(white, compute_uv=False) > SIGNIFICANT))
 
@@ -203,11 +247,14 @@ def _distances(
 ) -> Float[np.ndarray, " n"]:
     """Distances from the measured positions in standard deviations."""
     away = fit.points(centers) - positions
-    return np.sqrt(np.einsum("ni,ni->n", away, np.linalg.solve(covariances, away[:, :, None])[:, :, 0]))
+    return np.sqrt(
+        np.einsum("ni,ni->n", away, np.linalg.solve(covariances, away[:, :, None])[:, :, 0])
+    )
 
 
 def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
-    """Raises ProblemError: positions fit well with other axes or units only: degrees, or mirrored."""
+    """Raises ProblemError: positions fit well with other axes or units only: degrees, or
+    mirrored."""
     if len(centers) < LEAST_IMAGES - 1:
         return
     few = len(centers) < LEAST_IMAGES
@@ -215,19 +262,31 @@ def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
     for latitude, longitude in ((0, 1), (1, 0)):
         middle = np.median(positions, axis=0)
         near = np.median(np.abs(positions - middle)[:, :2].max(axis=1)) < LARGEST_AREA
-        if near and np.abs(positions[:, latitude]).max() <= 90 and np.abs(positions[:, longitude]).max() <= 180:
-            east, north = (np.radians(positions - middle)[:, at] * EARTH for at in (longitude, latitude))
-            metres = np.stack([east * np.cos(np.radians(middle[latitude])), north, positions[:, 2]], axis=1)
-            others.append((metres, "latitude and longitude in degrees: give metres, or crs: EPSG:4326"))
+        if (
+            near
+            and np.abs(positions[:, latitude]).max() <= 90
+            and np.abs(positions[:, longitude]).max() <= 180
+        ):
+            east, north = (
+                np.radians(positions - middle)[:, at] * EARTH for at in (longitude, latitude)
+            )
+            metres = np.stack(
+                [east * np.cos(np.radians(middle[latitude])), north, positions[:, 2]], axis=1
+            )
+            others.append(
+                (metres, "latitude and longitude in degrees: give metres, or crs: EPSG:4326")
+            )
     misfit = _misfit(centers, positions)
     for other, what in others:
         if _misfit(centers, other) < min((EXPLAINED if few else BETTER) * misfit, EXPLAINED):
-            raise ProblemError(f"the positions seem to be {what} (align: false takes them as they are)")
+            raise ProblemError(
+                f"the positions seem to be {what} (align: false takes them as they are)"
+            )
 
 
 def _misfit(centers: np.ndarray, positions: np.ndarray) -> float:
-    """Median distance of the centres from the positions that they best fit, as a share of the extent; of few ones the
-    largest distance."""
+    """Median distance of the centres from the positions that they best fit, as a share of the
+    extent; of few ones the largest distance."""
     extent = float(np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
     if not extent > 0:
         return np.inf

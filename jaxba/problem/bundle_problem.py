@@ -1,6 +1,7 @@
 """The bundle adjustment problem: parameters, observations, and the checks that they are valid.
 
-A `BundleProblem` made by `BundleProblem.create` is finite, has observations, and indices in range."""
+A `BundleProblem` made by `BundleProblem.create` is finite, has observations, and indices in
+range."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from jaxba.problem.residuals import Residuals
 from jaxba.problem.rigs import Rigs, checked_rigs
 from jaxba.typing import AnyArray, ArrayRecord, InputError, register_pytree
 
-CAMERA_SIZE = 9  # parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2
+# parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2
+CAMERA_SIZE = 9
 POINT_SIZE = 3  # parameters of a point: x, y, z in scene units
 
 
@@ -37,11 +39,15 @@ class NothingObserved(ProblemError):
 def check_is_problem(problem: Any) -> None:
     """Raises ValueError: it is something else; one line."""
     if not isinstance(problem, BundleProblem):
-        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {shown(problem)}")
+        raise ValueError(
+            "problem must be a BundleProblem, as jaxba.read_problem returns it, not "
+            f"{shown(problem)}"
+        )
 
 
 class ProblemWarning(UserWarning):
-    """A part of the input was left out, was mended, or looks wrong. The message is one line for the user."""
+    """A part of the input was left out, was mended, or looks wrong. The message is one line for the
+    user."""
 
 
 @register_pytree
@@ -53,20 +59,22 @@ class BundleProblem(ArrayRecord):
 
         P = R(w) X + t,    p = -P.xy / P.z,    z = f (1 + k1 |p|^2 + k2 |p|^4) p
 
-    With lenses of other camera models (`jaxba.CAMERA_MODELS`) a camera is `[w, t, numbers]`, and z the model's pixel of
-    the point (P.x, -P.y, -P.z): poses look down -z as BAL's do, and pixels are those of the model.
+    With lenses of other camera models (`jaxba.CAMERA_MODELS`) a camera is `[w, t, numbers]`, and z
+    the model's pixel of the point (P.x, -P.y, -P.z): poses look down -z as BAL's do, and pixels are
+    those of the model.
 
     Source: Agarwal et al. 2010, "Bundle Adjustment in the Large"."""
 
     cameras: Float[AnyArray, "cameras parameters"]
-    """Angle-axis (radians), translation (scene units), and the lens: f (pixels), k1 and k2, or the numbers of its
-    camera model, with zeros after them where another model has more."""
+    """Angle-axis (radians), translation (scene units), and the lens: f (pixels), k1 and k2, or the
+    numbers of its camera model, with zeros after them where another model has more."""
 
     points: Float[AnyArray, "points 3"]
     """Positions in scene units."""
 
     observations: Float[AnyArray, "observations 2"]
-    """Measured pixels; of a BAL lens with the origin at the image centre, x to the right, y upwards."""
+    """Measured pixels; of a BAL lens with the origin at the image centre, x to the right, y
+    upwards."""
 
     camera_index: Int[AnyArray, " observations"]
     """Camera of each observation, int32."""
@@ -78,7 +86,8 @@ class BundleProblem(ArrayRecord):
     """`Sigma^(-1/2)` of each observation (1 / pixels); None: the identity."""
 
     lenses: Lenses | None = None
-    """Shared and fixed intrinsics, and camera models; None: every camera has its own BAL lens, all optimised."""
+    """Shared and fixed intrinsics, and camera models; None: every camera has its own BAL lens, all
+    optimised."""
 
     constants: Constants | None = None
     """Constant poses and points; None: all are optimised."""
@@ -107,37 +116,47 @@ class BundleProblem(ArrayRecord):
         constants: Constants | None = None,
         rigs: Rigs | None = None,
     ) -> BundleProblem:
-        """Checks the arrays and returns a problem of float64 and int32 NumPy arrays. Raises ProblemError: shapes
-        differ, an index is out of range, a number is not finite, there is an empty array of observations, a covariance
-        is not positive definite, cameras of one lens differ in their intrinsics, or a part of the problem does not fit
-        the others.
+        """Checks the arrays and returns a problem of float64 and int32 NumPy arrays. Raises
+        ProblemError: shapes differ, an index is out of range, a number is not finite, there is an
+        empty array of observations, a covariance is not positive definite, cameras of one lens
+        differ in their intrinsics, or a part of the problem does not fit the others.
 
         Args:
             cameras: shape (cameras, 9), or (cameras, 6 + numbers of the largest camera model).
             points: shape (points, 3).
-            observations: shape (observations, 2), pixels. Without them and points a problem has cameras alone, whose
-                lenses are constant, and needs other residuals (`jaxba.with_residual`): a pose graph.
+            observations: shape (observations, 2), pixels. Without them and points a problem has
+                cameras alone, whose lenses are constant, and needs other residuals
+                (`jaxba.with_residual`): a pose graph.
             camera_index: shape (observations,), integers in [0, cameras).
             point_index: shape (observations,), integers in [0, points).
             covariance: optional, shape (observations, 2, 2), pixels squared; symmetric and
                 positive definite. The cost then uses `|Sigma^(-1/2) r|^2`.
             weight: optional, shape (observations,), non-negative; multiplies the squared
                 residual, like the covariance `I / weight`. Excludes `covariance`.
-            lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
+            lenses: optional; which cameras share intrinsics, of which models these are, and which
+                are optimised.
             constants: optional; poses and points that are not optimised.
             rigs: optional; cameras that move together."""
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
-        parts = {"lenses": (lenses, Lenses), "constants": (constants, Constants), "rigs": (rigs, Rigs)}
+        parts = {
+            "lenses": (lenses, Lenses),
+            "constants": (constants, Constants),
+            "rigs": (rigs, Rigs),
+        }
         for name, (part, kind) in parts.items():
             if part is not None and not isinstance(part, kind):
-                raise ProblemError(f"{name} must be a {kind.__name__}, not of type {type(part).__name__}")
+                raise ProblemError(
+                    f"{name} must be a {kind.__name__}, not of type {type(part).__name__}"
+                )
         try:
             cameras = _floats("cameras", cameras, POSE_SIZE + lens_size(lenses))
             alone = points is None and observations is None
             if alone:
                 points, observations = np.zeros((0, POINT_SIZE)), np.zeros((0, 2))
-                lenses = lenses or Lenses(np.arange(len(cameras)), np.zeros((len(cameras), LENS_SIZE), bool))
+                lenses = lenses or Lenses(
+                    np.arange(len(cameras)), np.zeros((len(cameras), LENS_SIZE), bool)
+                )
             points = _floats("points", points, POINT_SIZE)
             observations = _floats("observations", observations, 2)
             whitening = _whitening(covariance, weight, len(observations))
@@ -158,14 +177,17 @@ class BundleProblem(ArrayRecord):
 
     def __repr__(self) -> str:
         arrays = ("cameras", "points", "observations")
-        counts = [f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays]
+        counts = [
+            f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays
+        ]
         parts = ("whitening", "lenses", "constants", "rigs", "labels")
         own = [f"{len(rows)} rows of {rows.residual.name}" for rows in self.residuals.rows]
         found = [*counts, *(name for name in parts if getattr(self, name) is not None), *own]
         return f"BundleProblem({', '.join(found)})"
 
     def _repr_html_(self) -> str:
-        return importlib.import_module("jaxba.problem.display").card_of(self)  # which imports this module, and pictures
+        # which imports this module, and pictures
+        return importlib.import_module("jaxba.problem.display").card_of(self)
 
     @property
     def num_cameras(self) -> int:
@@ -192,20 +214,30 @@ class BundleProblem(ArrayRecord):
         cameras: Int[np.ndarray, " _"] | None = None,
         points: Int[np.ndarray, " _"] | None = None,
     ) -> BundleProblem:
-        """The problem with some of its observations and, if they are given, of its cameras and points. `observations`
-        is a mask or positions; they name no other cameras and points than those that stay. `cameras` and `points` are
-        positions, ascending; None: all. Lenses and frames keep their numbers. With points or cameras given there are no
-        labels, and no residuals but those of pixels, unless the problem is laid out (structure/residual_slots.py)."""
+        """The problem with some of its observations and, if they are given, of its cameras and
+        points. `observations` is a mask or positions; they name no other cameras and points than
+        those that stay. `cameras` and `points` are positions, ascending; None: all. Lenses and
+        frames keep their numbers. With points or cameras given there are no labels, and no
+        residuals but those of pixels, unless the problem is laid out
+        (structure/residual_slots.py)."""
         names = ("observations", "camera_index", "point_index", "whitening")
         arrays = {name: getattr(self, name) for name in names}
-        found = replace(self, **{name: np.asarray(x)[observations] for name, x in arrays.items() if x is not None})
+        found = replace(
+            self,
+            **{name: np.asarray(x)[observations] for name, x in arrays.items() if x is not None},
+        )
         if self.constants is not None:
             of_both = (slice(None) if kept is None else kept for kept in (cameras, points))
             found = replace(found, constants=self.constants.of(*of_both))
         if points is not None:
             index = np.searchsorted(points, found.point_index).astype(np.int32)
-            found = replace(found, points=np.asarray(self.points)[points], point_index=index, labels=None)
-            found = replace(found, residuals=self.residuals and self.residuals.of(np.asarray(observations), points))
+            found = replace(
+                found, points=np.asarray(self.points)[points], point_index=index, labels=None
+            )
+            found = replace(
+                found,
+                residuals=self.residuals and self.residuals.of(np.asarray(observations), points),
+            )
         if cameras is None:
             return found
         return replace(
@@ -224,7 +256,8 @@ def _floats(name: str, values: Any, width: int) -> np.ndarray:
     array = real_numbers(name, values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ProblemError(f"{name} must have shape (n, {width}), not {array.shape}")
-    if array.size and not np.isfinite([array.min(), array.max()]).all():  # without an array as large for this
+    # without an array as large for this
+    if array.size and not np.isfinite([array.min(), array.max()]).all():
         bad = np.isfinite(array).all(axis=1).argmin()
         raise ProblemError(f"{name}[{bad}] is not finite: {array[bad].tolist()}")
     return array
@@ -243,7 +276,9 @@ def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
         return None
     covariance = real_numbers("covariance", covariance)
     if covariance.shape != (count, 2, 2) or not np.isfinite(covariance).all():
-        raise ProblemError(f"covariance must be finite, of shape ({count}, 2, 2), not {covariance.shape}")
+        raise ProblemError(
+            f"covariance must be finite, of shape ({count}, 2, 2), not {covariance.shape}"
+        )
     roots, bad = inverse_roots(covariance)
     if bad.size:
         raise ProblemError(f"covariance[{bad[0]}] is not symmetric positive definite")

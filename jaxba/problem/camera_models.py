@@ -1,12 +1,16 @@
-"""Camera models: functions from a point in the camera's frame and the numbers of its lens to a pixel.
+"""Camera models: functions from a point in the camera's frame and the numbers of its lens to a
+pixel.
 
-The frame is that of COLMAP and OpenCV: x to the right, y downwards, z forwards. A model is written once, for NumPy and
-JAX, elementwise over arrays of any shape; its derivatives come by forward mode (`jaxba.model.camera`).
+The frame is that of COLMAP and OpenCV: x to the right, y downwards, z forwards. A model is written
+once, for NumPy and JAX, elementwise over arrays of any shape; its derivatives come by forward mode
+(`jaxba.model.camera`).
 
-Perspective models project to `(u, v) = (x, y) / z`. Fisheye models project to `theta (x, y) / r` with
-`r^2 = x^2 + y^2` and `theta = atan2(r, z)`. Both then distort (u, v) and map it to `(fx u + cx, fy v + cy)`.
+Perspective models project to `(u, v) = (x, y) / z`. Fisheye models project to `theta (x, y) / r`
+with `r^2 = x^2 + y^2` and `theta = atan2(r, z)`. Both then distort (u, v) and map it to `(fx u +
+cx, fy v + cy)`.
 
-Source: COLMAP 4.2, src/colmap/sensor/models.h, whose names, numbers and order of parameters these are."""
+Source: COLMAP 4.2, src/colmap/sensor/models.h, whose names, numbers and order of parameters these
+are."""
 
 from __future__ import annotations
 
@@ -17,7 +21,8 @@ from typing import Any
 
 FOV_SMALL = 1e-4  # squared radius or squared omega below which FOV is a series, as in COLMAP
 
-NEARLY_ON_AXIS = 1e-20  # `r^2 / z^2` below which a fisheye projects as a pinhole: the difference is below rounding
+# `r^2 / z^2` below which a fisheye projects as a pinhole: the difference is below rounding
+NEARLY_ON_AXIS = 1e-20
 
 Pixel = tuple[Any, Any]
 
@@ -30,13 +35,15 @@ class CameraModel:
     """Name in the registry and in files of COLMAP."""
 
     parameters: tuple[str, ...]
-    """Names of the numbers of a lens, in COLMAP's order: `f` or `fx`, `fy`; `cx`, `cy`; then distortion."""
+    """Names of the numbers of a lens, in COLMAP's order: `f` or `fx`, `fy`; `cx`, `cy`; then
+    distortion."""
 
     project: Callable[[Sequence[Any], Any, Any, Any], Pixel]
     """From the numbers of lenses, and x, y and z of points in the camera's frame, to pixels."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """By name, so that a problem may be pickled: of a model that is registered where it is unpickled."""
+        """By name, so that a problem may be pickled: of a model that is registered where it is
+        unpickled."""
         return _registered, (self.name,)
 
     def __len__(self) -> int:
@@ -71,11 +78,12 @@ def _registered(name: str) -> CameraModel:
 
 
 def register_camera_model(name: str, parameters: str, project: Callable[..., Pixel]) -> CameraModel:
-    """Adds a camera model to `CAMERA_MODELS`. `parameters` are the names of the numbers of a lens, separated by spaces:
-    focal lengths are called `f`, or `fx` and `fy`; the principal point `cx` and `cy`; everything else counts as
-    distortion. `project` goes from a sequence of these numbers, and x, y and z in the camera's frame (x right, y down,
-    z forwards, scene units), to the two coordinates of a pixel. Written with operators and functions of
-    `x.__array_namespace__()`, it serves NumPy and JAX. Raises ValueError: another model has the name."""
+    """Adds a camera model to `CAMERA_MODELS`. `parameters` are the names of the numbers of a lens,
+    separated by spaces: focal lengths are called `f`, or `fx` and `fy`; the principal point `cx`
+    and `cy`; everything else counts as distortion. `project` goes from a sequence of these numbers,
+    and x, y and z in the camera's frame (x right, y down, z forwards, scene units), to the two
+    coordinates of a pixel. Written with operators and functions of `x.__array_namespace__()`, it
+    serves NumPy and JAX. Raises ValueError: another model has the name."""
     model = CameraModel(name, tuple(parameters.split()), project)
     if CAMERA_MODELS.get(name, model) != model:
         raise ValueError(f"there is a camera model {name} already")
@@ -84,7 +92,8 @@ def register_camera_model(name: str, parameters: str, project: Callable[..., Pix
 
 
 def _bal(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
-    """BAL's camera: pixels have y upwards. Source: Agarwal et al. 2010, "Bundle Adjustment in the Large"."""
+    """BAL's camera: pixels have y upwards. Source: Agarwal et al. 2010, "Bundle Adjustment in the
+    Large"."""
     f, k1, k2 = lens
     u, v = x / z, y / z
     r2 = u * u + v * v
@@ -135,14 +144,18 @@ def _brown(u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any) -> Pixel:
     return factor * u + du, factor * v + dv
 
 
-def _rational(u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any, k3: Any, k4: Any, k5: Any, k6: Any) -> Pixel:
+def _rational(
+    u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any, k3: Any, k4: Any, k5: Any, k6: Any
+) -> Pixel:
     factor, r2 = _radial(u, v, (k1, k2, k3))
     factor = factor / _radial(u, v, (k4, k5, k6))[0]
     du, dv = _tangential(u, v, r2, p1, p2)
     return factor * u + du, factor * v + dv
 
 
-def _thin_prism(u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any, k3: Any, k4: Any, sx1: Any, sy1: Any) -> Pixel:
+def _thin_prism(
+    u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any, k3: Any, k4: Any, sx1: Any, sy1: Any
+) -> Pixel:
     factor, r2 = _radial(u, v, (k1, k2, k3, k4))
     du, dv = _tangential(u, v, r2, p1, p2)
     return factor * u + du + sx1 * r2, factor * v + dv + sy1 * r2
@@ -159,8 +172,8 @@ def _rad_tan_thin_prism(u: Any, v: Any, *numbers: Any) -> Pixel:
 
 
 def _field_of_view(u: Any, v: Any, omega: Any) -> Pixel:
-    """`atan(2 r tan(omega / 2)) / (r omega)`. Source: Devernay and Faugeras 2001, "Straight lines have to be
-    straight"; the two series are COLMAP's."""
+    """`atan(2 r tan(omega / 2)) / (r omega)`. Source: Devernay and Faugeras 2001, "Straight lines
+    have to be straight"; the two series are COLMAP's."""
     xp = u.__array_namespace__()
     r2, omega2 = u * u + v * v, omega * omega
     flat, near = omega2 < FOV_SMALL, r2 < FOV_SMALL
@@ -174,8 +187,8 @@ def _field_of_view(u: Any, v: Any, omega: Any) -> Pixel:
 
 
 def _division(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
-    """The distorted point whose undistorted one is `(u, v) / (1 + k r^2)`. Source: Fitzgibbon 2001, "Simultaneous
-    linear estimation of multiple view geometry and lens distortion"."""
+    """The distorted point whose undistorted one is `(u, v) / (1 + k r^2)`. Source: Fitzgibbon 2001,
+    "Simultaneous linear estimation of multiple view geometry and lens distortion"."""
     *focal, cx, cy, k = lens
     xp = x.__array_namespace__()
     scale = 2 / (z + xp.sqrt(z * z - 4 * k * (x * x + y * y)))
@@ -191,15 +204,22 @@ def _enhanced_unified(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
 
 
 def _equirectangular(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
-    """Pixels jump by the width where x = 0 behind the camera: an error there is not taken around the seam."""
+    """Pixels jump by the width where x = 0 behind the camera: an error there is not taken around
+    the seam."""
     width, height = lens
     xp = x.__array_namespace__()
     pi = 3.141592653589793
-    return width * (xp.atan2(x, z) / (2 * pi) + 0.5), height * (xp.atan2(y, xp.sqrt(x * x + z * z)) / pi + 0.5)
+    return width * (xp.atan2(x, z) / (2 * pi) + 0.5), height * (
+        xp.atan2(y, xp.sqrt(x * x + z * z)) / pi + 0.5
+    )
 
 
 def _distorted(
-    to_plane: Callable[..., Pixel], distort: Callable[..., Pixel], focals: int, lens: Sequence[Any], *place: Any
+    to_plane: Callable[..., Pixel],
+    distort: Callable[..., Pixel],
+    focals: int,
+    lens: Sequence[Any],
+    *place: Any,
 ) -> Pixel:
     """The pixel of a model that projects to the plane, distorts there, and scales to pixels."""
     cx, cy, *coefficients = lens[focals:]
@@ -224,7 +244,13 @@ for _name, _focals, _coefficients, _to_plane, _distort in (
     ("SIMPLE_RADIAL_FISHEYE", 1, "k1", _equidistant, _polynomial),
     ("RADIAL_FISHEYE", 1, "k1 k2", _equidistant, _polynomial),
     ("THIN_PRISM_FISHEYE", 2, "k1 k2 p1 p2 k3 k4 sx1 sy1", _equidistant, _thin_prism),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", _equidistant, _rad_tan_thin_prism),
+    (
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        2,
+        "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+        _equidistant,
+        _rad_tan_thin_prism,
+    ),
     ("SIMPLE_FISHEYE", 1, "", _equidistant, _no_distortion),
     ("FISHEYE", 2, "", _equidistant, _no_distortion),
 ):

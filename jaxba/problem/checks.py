@@ -20,7 +20,8 @@ def shown(value: Any, longest: int = SHOWN) -> str:
 
 
 def plain_array(name: str, values: Any) -> np.ndarray:
-    """A NumPy array. Raises ValueError: rows differ in length, or masked entries. Raises TypeError: JAX traces them."""
+    """A NumPy array. Raises ValueError: rows differ in length, or masked entries. Raises TypeError:
+    JAX traces them."""
     if np.ma.is_masked(values):
         raise ValueError(f"{name} must have no masked entries")
     try:
@@ -32,7 +33,8 @@ def plain_array(name: str, values: Any) -> np.ndarray:
 
 
 def real_numbers(name: str, values: Any) -> np.ndarray:
-    """A contiguous float64 array. Raises ValueError: no real numbers, or no array. Raises TypeError: traced."""
+    """A contiguous float64 array. Raises ValueError: no real numbers, or no array. Raises
+    TypeError: traced."""
     array = plain_array(name, values)
     try:
         if array.dtype.kind in "biufO":
@@ -51,18 +53,24 @@ def real_number(name: str, value: Any) -> float:
 
 
 def random_numbers(seed: Any) -> np.random.Generator:
-    """The generator of a seed, or a generator itself. Raises ValueError: the seed is neither; one line."""
+    """The generator of a seed, or a generator itself. Raises ValueError: the seed is neither; one
+    line."""
     try:
         return np.random.default_rng(seed)
     except (TypeError, ValueError):
-        raise ValueError(f"seed must be a whole number that is not negative, not {shown(seed)}") from None
+        raise ValueError(
+            f"seed must be a whole number that is not negative, not {shown(seed)}"
+        ) from None
 
 
 def indices(name: str, values: Any, bound: int, count: int) -> Int[np.ndarray, " n"]:
-    """The values as an int32 vector of that many entries in [0, bound). Raises ValueError: they are none; one line."""
+    """The values as an int32 vector of that many entries in [0, bound). Raises ValueError: they are
+    none; one line."""
     array = plain_array(name, values)
     if array.shape != (count,) or (count and array.dtype.kind not in "iu"):
-        raise ValueError(f"{name} must be a vector of {count} integers, not {array.dtype} of shape {array.shape}")
+        raise ValueError(
+            f"{name} must be a vector of {count} integers, not {array.dtype} of shape {array.shape}"
+        )
     if count and (array.min() < 0 or array.max() >= bound):
         bad = np.flatnonzero((array < 0) | (array >= bound))[0]
         raise ValueError(f"{name}[{bad}] is {array[bad]}, outside 0..{bound - 1}")
@@ -70,9 +78,13 @@ def indices(name: str, values: Any, bound: int, count: int) -> Int[np.ndarray, "
 
 
 def finite(what: str, value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Finite numbers as a float64 array of one of the given shapes; `what` begins the message. Raises ValueError:
-    something else; one line. Raises TypeError: JAX traces them."""
-    wanted = "be one number" if shapes == ((),) else f"have shape {' or '.join(map(str, dict.fromkeys(shapes)))}"
+    """Finite numbers as a float64 array of one of the given shapes; `what` begins the message.
+    Raises ValueError: something else; one line. Raises TypeError: JAX traces them."""
+    wanted = (
+        "be one number"
+        if shapes == ((),)
+        else f"have shape {' or '.join(map(str, dict.fromkeys(shapes)))}"
+    )
     try:
         array = plain_array(what, value)
     except ValueError:
@@ -89,7 +101,8 @@ def finite(what: str, value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray,
 def inverse_roots(
     covariances: Float[np.ndarray, "n k k"], least: float = 0.0
 ) -> tuple[Float[np.ndarray, "n k k"], Int[np.ndarray, " bad"]]:
-    """`Sigma^(-1/2)` of covariances, and which of them are not symmetric with eigenvalues above the least one."""
+    """`Sigma^(-1/2)` of covariances, and which of them are not symmetric with eigenvalues above the
+    least one."""
     values, vectors = np.linalg.eigh(covariances)
     asymmetry = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     good = (values[:, 0] > least) & (asymmetry <= 1e-9 * np.abs(values).max(axis=1, initial=0.0))

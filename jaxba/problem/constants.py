@@ -12,7 +12,8 @@ from jaxba.problem.checks import plain_array
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-ROTATION = np.array([True, True, True, False, False, False])  # the numbers of a pose that are its rotation
+# the numbers of a pose that are its rotation
+ROTATION = np.array([True, True, True, False, False, False])
 
 
 @register_pytree
@@ -21,7 +22,8 @@ class Constants(ArrayRecord):
     """The numbers of poses and the points that are not optimised. They come back bit for bit."""
 
     poses: Bool[AnyArray, "cameras 6"]
-    """Constant numbers of each pose: the rotation (all three or none), and each of the translation."""
+    """Constant numbers of each pose: the rotation (all three or none), and each of the
+    translation."""
 
     points: Bool[AnyArray, " points"]
     """Constant points."""
@@ -32,12 +34,20 @@ class Constants(ArrayRecord):
 
 
 def checked_constants(constants: Constants, cameras: int, points: int) -> Constants | None:
-    """Checks constants and returns them as NumPy arrays; None if nothing is constant. Raises ValueError: shapes or
-    types differ, or part of a rotation is constant; one line."""
-    poses, fixed = plain_array("constant poses", constants.poses), plain_array("constant points", constants.points)
-    for name, array, shape in (("poses", poses, (cameras, POSE_SIZE)), ("points", fixed, (points,))):
+    """Checks constants and returns them as NumPy arrays; None if nothing is constant. Raises
+    ValueError: shapes or types differ, or part of a rotation is constant; one line."""
+    poses, fixed = (
+        plain_array("constant poses", constants.poses),
+        plain_array("constant points", constants.points),
+    )
+    for name, array, shape in (
+        ("poses", poses, (cameras, POSE_SIZE)),
+        ("points", fixed, (points,)),
+    ):
         if array.dtype != bool or array.shape != shape:
-            raise ValueError(f"constant {name} must be bool of shape {shape}, not {array.dtype}{array.shape}")
+            raise ValueError(
+                f"constant {name} must be bool of shape {shape}, not {array.dtype}{array.shape}"
+            )
     bad = np.flatnonzero(poses[:, :3].any(axis=1) != poses[:, :3].all(axis=1))
     if bad.size:
         raise ValueError(f"the rotation of camera {bad[0]} can only be constant as a whole")

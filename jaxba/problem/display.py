@@ -30,9 +30,13 @@ class Picture(Figure):
 def card(rows: Mapping[str, str], picture: Picture) -> str:
     """A table of names and values beside a picture, as HTML."""
     data = base64.b64encode(picture._repr_png_()).decode()
-    cells = "".join(f"<tr><th>{name}<td>{html.escape(text).replace(', ', '<br>')}" for name, text in rows.items())
+    cells = "".join(
+        f"<tr><th>{name}<td>{html.escape(text).replace(', ', '<br>')}"
+        for name, text in rows.items()
+    )
     image = f'<img alt="" style="max-width:24em" src="data:image/png;base64,{data}">'
-    return f'<div style="display:flex;flex-wrap:wrap;align-items:center"><table>{cells}</table>{image}</div>'
+    style = "display:flex;flex-wrap:wrap;align-items:center"
+    return f'<div style="{style}"><table>{cells}</table>{image}</div>'
 
 
 def card_of(problem: BundleProblem) -> str:

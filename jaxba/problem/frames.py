@@ -18,7 +18,8 @@ from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs, first_of_group, frame_pose
 def in_frames(problem: BundleProblem) -> BundleProblem:
     """The problem with the poses of frames, and the extrinsics of each camera after its lens.
 
-    Without rigs, or where no two observed cameras are of one frame, it is the problem itself, without rigs."""
+    Without rigs, or where no two observed cameras are of one frame, it is the problem itself,
+    without rigs."""
     rigs = problem.rigs
     if rigs is None:
         return problem
@@ -39,8 +40,8 @@ def in_frames(problem: BundleProblem) -> BundleProblem:
 def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
     """Which numbers of poses are optimised, and in rigs of extrinsics, of a problem `in_frames`.
 
-    Constant numbers of one camera are constant in its frame, also of one that nothing sees. The extrinsics of a lens
-    are constant where the pose of some camera of it is."""
+    Constant numbers of one camera are constant in its frame, also of one that nothing sees. The
+    extrinsics of a lens are constant where the pose of some camera of it is."""
     constants, rigs = problem.constants, problem.rigs
     shape = problem.num_cameras, POSE_SIZE
     held = np.zeros(shape, bool) if constants is None else np.asarray(constants.poses)
@@ -56,8 +57,8 @@ def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
 
 
 def num_unknowns(problem: BundleProblem) -> int:
-    """How many numbers of a problem are optimised: of poses, lenses, places in rigs, observed points and blocks of
-    residuals, each once. Source: Ceres, `num_effective_parameters_reduced`."""
+    """How many numbers of a problem are optimised: of poses, lenses, places in rigs, observed
+    points and blocks of residuals, each once. Source: Ceres, `num_effective_parameters_reduced`."""
     here, (cameras, points) = in_frames(problem), observed(problem)
     free, seen, lenses = free_poses(here), np.flatnonzero(cameras), every_lens(problem)
     lens = np.asarray(lenses.index)
@@ -65,11 +66,17 @@ def num_unknowns(problem: BundleProblem) -> int:
     frames, images = (seen[np.unique(group[seen], return_index=True)[1]] for group in (frame, lens))
     points = points if problem.constants is None else points & ~np.asarray(problem.constants.points)
     blocks = sum(block.size for block in problem.residuals.blocks)
-    of_cameras = free[frames, :POSE_SIZE].sum() + free[images, POSE_SIZE:].sum() + lenses.free[lens[images]].sum()
+    of_cameras = (
+        free[frames, :POSE_SIZE].sum()
+        + free[images, POSE_SIZE:].sum()
+        + lenses.free[lens[images]].sum()
+    )
     return int(of_cameras + 3 * points.sum() + blocks)
 
 
-def _any_of_group(group: np.ndarray, values: Bool[np.ndarray, "cameras 6"]) -> Bool[np.ndarray, "cameras 6"]:
+def _any_of_group(
+    group: np.ndarray, values: Bool[np.ndarray, "cameras 6"]
+) -> Bool[np.ndarray, "cameras 6"]:
     """Whether a value is true of any camera of the same group."""
     _, own = np.unique(group, return_inverse=True)
     found = np.zeros(values.shape, bool)
@@ -80,7 +87,8 @@ def _any_of_group(group: np.ndarray, values: Bool[np.ndarray, "cameras 6"]) -> B
 def out_of_frames(
     problem: BundleProblem, cameras: Float[np.ndarray, "cameras more"]
 ) -> tuple[Float[np.ndarray, "cameras parameters"], Rigs]:
-    """Cameras and rigs for cameras of a problem as `in_frames` has them. Constant extrinsics are copied exactly."""
+    """Cameras and rigs for cameras of a problem as `in_frames` has them. Constant extrinsics are
+    copied exactly."""
     from scipy.spatial.transform import Rotation
 
     assert problem.rigs is not None

@@ -1,4 +1,5 @@
-"""A gauge: constants that fix the position, orientation and scale of a scene, as far as they are free."""
+"""A gauge: constants that fix the position, orientation and scale of a scene, as far as they are
+free."""
 
 from __future__ import annotations
 
@@ -20,21 +21,25 @@ from jaxba.problem.preprocess import far_middle, observed, shift
 
 Gauge = Literal["free", "two-cameras", "three-points"]
 
-LEVER = 1e-6  # smallest step of a number (radians, extents of the scene) by which it fixes a direction
+# smallest step of a number (radians, extents of the scene) by which it fixes a direction
+LEVER = 1e-6
 
 
 def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
-    """The problem with its position, orientation and scale fixed, as far as constants, rigs and residuals leave them.
+    """The problem with its position, orientation and scale fixed, as far as constants, rigs and
+    residuals leave them.
 
-    `two-cameras`: as many numbers are constant as directions are free, so the minimum stays as it is. They are of the
-    pose of a constant camera, or of the one nearest to the middle, and of the translation of the one farthest from it.
-    Where these do not suffice, as in a single frame of a rig, three points are. `three-points`: up to three points that
-    many images see and that are far apart are constant; three are two numbers more than are free. `free`: no more than
-    is. A `ProblemWarning` says that all is fixed already, that points stand for cameras, or that still more is held.
+    `two-cameras`: as many numbers are constant as directions are free, so the minimum stays as it
+    is. They are of the pose of a constant camera, or of the one nearest to the middle, and of the
+    translation of the one farthest from it. Where these do not suffice, as in a single frame of a
+    rig, three points are. `three-points`: up to three points that many images see and that are far
+    apart are constant; three are two numbers more than are free. `free`: no more than is. A
+    `ProblemWarning` says that all is fixed already, that points stand for cameras, or that still
+    more is held.
 
-    In a scene far from the origin (`preprocess.FAR`) the numbers of a translation are those of the scene shifted to it.
-    Raises ValueError: no such gauge. Raises ProblemError: too few points are observed. Source: COLMAP,
-    `FixGaugeWithTwoCamsFromWorld`, `FixGaugeWithThreePoints`."""
+    In a scene far from the origin (`preprocess.FAR`) the numbers of a translation are those of the
+    scene shifted to it. Raises ValueError: no such gauge. Raises ProblemError: too few points are
+    observed. Source: COLMAP, `FixGaugeWithTwoCamsFromWorld`, `FixGaugeWithThreePoints`."""
     check_known("gauge", gauge, Gauge)
     gauged = fixed_gauge(problem, gauge)
     if gauged is problem and gauge != "free":
@@ -53,16 +58,24 @@ def fixed_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if not free:
         return problem
     usual = free
-    found = _two_cameras(problem, steps[:, :POSE_SIZE] @ directions) if gauge == "two-cameras" else None
+    found = (
+        _two_cameras(problem, steps[:, :POSE_SIZE] @ directions) if gauge == "two-cameras" else None
+    )
     if found is None:
         if gauge == "two-cameras":
-            note("two cameras cannot fix position, orientation and scale: the gauge holds three points")
+            note(
+                "two cameras cannot fix position, orientation and scale: the gauge holds three "
+                "points"
+            )
         usual = free + 2
         found = _three_points(problem)
     held = _held_numbers(found) - _held_numbers(problem.constants)
     if held > usual:
         known = f"{SIMILARITY - free} of {SIMILARITY} directions of the scene are fixed already"
-        note(f"{known}: the gauge holds more than is free, {held} numbers; hold poses or points instead")
+        note(
+            f"{known}: the gauge holds more than is free, {held} numbers; hold poses or points "
+            "instead"
+        )
     return problem.replace(constants=found)
 
 
@@ -71,13 +84,21 @@ def _held_numbers(constants: Constants | None) -> int:
     return 0 if constants is None else int(constants.poses.sum() + 3 * constants.points.sum())
 
 
-def _two_cameras(problem: BundleProblem, steps: Float[np.ndarray, "cameras 6 directions"]) -> Constants | None:
-    """The constants, with numbers of two cameras that fix all directions; None if there are none. `steps` are those of
-    poses along the directions, radians and extents of the scene, zero for what is constant."""
-    here, constants = in_frames(problem), constants_of(problem.constants, problem.num_cameras, problem.num_points)
+def _two_cameras(
+    problem: BundleProblem, steps: Float[np.ndarray, "cameras 6 directions"]
+) -> Constants | None:
+    """The constants, with numbers of two cameras that fix all directions; None if there are none.
+    `steps` are those of poses along the directions, radians and extents of the scene, zero for what
+    is constant."""
+    here, constants = (
+        in_frames(problem),
+        constants_of(problem.constants, problem.num_cameras, problem.num_points),
+    )
     free, turned = free_poses(here), np.zeros(problem.num_cameras, bool)
-    seen = np.flatnonzero(observed(problem)[0] & ~free[:, POSE_SIZE:].any(axis=1))  # whose place in a rig is constant
-    if here.rigs is not None:  # of one frame only one, and with the axes of the frame if there are such
+    # whose place in a rig is constant
+    seen = np.flatnonzero(observed(problem)[0] & ~free[:, POSE_SIZE:].any(axis=1))
+    # of one frame only one, and with the axes of the frame if there are such
+    if here.rigs is not None:
         turned = here.rigs.turned
         seen = seen[np.argsort(turned[seen], kind="stable")]
         seen = seen[np.unique(np.asarray(here.rigs.frame)[seen], return_index=True)[1]]
@@ -89,7 +110,8 @@ def _two_cameras(problem: BundleProblem, steps: Float[np.ndarray, "cameras 6 dir
     first = int(np.argmin(np.where(whole | ~whole.any(), away(np.median(centers, axis=0)), np.inf)))
     second = int(np.argmax(np.where(turned[seen], -1.0, away(centers[first]))))
     left = np.eye(steps.shape[2])  # the directions that are free
-    blocks = [(first, [0, 1, 2], 3)]  # numbers, or the one of the translation that fixes most; how many it has to fix
+    # numbers, or the one of the translation that fixes most; how many it has to fix
+    blocks = [(first, [0, 1, 2], 3)]
     for at in (first, second):
         blocks += [(at, [3, 4, 5], 3)] if turned[seen[at]] else 3 * [(at, None, 1)]
     for at, block, least in (*blocks, (first, [0, 1, 2], 1)):
@@ -103,9 +125,13 @@ def _two_cameras(problem: BundleProblem, steps: Float[np.ndarray, "cameras 6 dir
 
 
 def _three_points(problem: BundleProblem) -> Constants:
-    """The constants, with points that fix all directions, three at most. Raises ProblemError: there are too few."""
+    """The constants, with points that fix all directions, three at most. Raises ProblemError: there
+    are too few."""
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    tracks, points = np.bincount(problem.point_index, minlength=problem.num_points), np.asarray(problem.points)
+    tracks, points = (
+        np.bincount(problem.point_index, minlength=problem.num_points),
+        np.asarray(problem.points),
+    )
     often = tracks >= max(2, int(np.median(tracks[tracks > 0])) if tracks.any() else 0)
     held = np.flatnonzero(constants.points & (tracks > 0)).tolist()
     for _ in range(3):

@@ -21,7 +21,8 @@ from jaxba.problem.labels import part_name
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
 
-GROUPS = ("focal", "principal_point", "distortion")  # groups of the numbers of a lens, as COLMAP's options name them
+# groups of the numbers of a lens, as COLMAP's options name them
+GROUPS = ("focal", "principal_point", "distortion")
 
 
 def hold(
@@ -34,18 +35,20 @@ def hold(
     numbers: Iterable[str] = (),
     extrinsics: Which = (),
 ) -> BundleProblem:
-    """The problem with more of it constant. Raises ValueError: no such image, lens, point or number, or `frames` of
-    which one has no image of a camera with a constant place in its rig; one line.
+    """The problem with more of it constant. Raises ValueError: no such image, lens, point or
+    number, or `frames` of which one has no image of a camera with a constant place in its rig; one
+    line.
 
     Args:
         problem: any problem.
-        poses: images whose pose is constant; `frames`: of all frames of rigs, in which cameras still move (COLMAP's
-            `refine_rig_from_world=False`).
+        poses: images whose pose is constant; `frames`: of all frames of rigs, in which cameras
+            still move (COLMAP's `refine_rig_from_world=False`).
         rotations: images whose rotation is constant; they still move. `frames` as for poses.
         points: constant points.
-        lenses: constant lenses: positions in `problem.lenses`, or of cameras where every camera has its own.
-        numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
-            camera model such as `k2`.
+        lenses: constant lenses: positions in `problem.lenses`, or of cameras where every camera has
+            its own.
+        numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the
+            name of a number of a camera model such as `k2`.
         extrinsics: lenses whose place in their rig is constant; of no effect without rigs."""
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
     constants.poses[_images(problem, poses)] = True
@@ -67,9 +70,12 @@ def hold(
 def release(problem: BundleProblem, *, numbers: Iterable[str]) -> BundleProblem:
     """The problem with numbers of all its lenses optimised. Arguments and errors as for `hold`.
 
-    The principal point of a BAL lens is no number of it: read COLMAP models with `refine_principal_point=True`."""
+    The principal point of a BAL lens is no number of it: read COLMAP models with
+    `refine_principal_point=True`."""
     own = every_lens(problem)
-    return problem.replace(lenses=replace(own, free=np.asarray(own.free) | number_columns(own, numbers)))
+    return problem.replace(
+        lenses=replace(own, free=np.asarray(own.free) | number_columns(own, numbers))
+    )
 
 
 def every_lens(problem: BundleProblem) -> Lenses:
@@ -80,7 +86,9 @@ def every_lens(problem: BundleProblem) -> Lenses:
     return Lenses(np.arange(count, dtype=np.int32), np.ones((count, LENS_SIZE), bool))
 
 
-def _images(problem: BundleProblem, which: Which | Literal["frames"]) -> Bool[np.ndarray, " cameras"]:
+def _images(
+    problem: BundleProblem, which: Which | Literal["frames"]
+) -> Bool[np.ndarray, " cameras"]:
     """A mask of images; of `frames` those whose camera has a constant place in its rig."""
     if not isinstance(which, str) or which != "frames":
         return mask_of(problem, which, problem.num_cameras, "image")
@@ -91,7 +99,9 @@ def _images(problem: BundleProblem, which: Which | Literal["frames"]) -> Bool[np
     lost = np.flatnonzero(~np.isin(frame, frame[known]))
     if len(lost):
         name = part_name(problem.labels, "image", int(lost[0]))
-        raise ValueError(f"the frame of {name} has no image of a camera with a constant place in its rig")
+        raise ValueError(
+            f"the frame of {name} has no image of a camera with a constant place in its rig"
+        )
     return known
 
 
@@ -100,15 +110,21 @@ def mask_of(problem: BundleProblem, which: Which, count: int, what: str) -> Bool
     mask = np.zeros(count, bool)
     if isinstance(which, str) and which != "all":
         raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
-    mask[slice(None) if isinstance(which, str) else positions_of(problem, which, what, count)] = True
+    mask[slice(None) if isinstance(which, str) else positions_of(problem, which, what, count)] = (
+        True
+    )
     return mask
 
 
 def positions_of(
-    problem: BundleProblem, which: Iterable[int] | Iterable[str] | np.ndarray, what: str, count: int | None = None
+    problem: BundleProblem,
+    which: Iterable[int] | Iterable[str] | np.ndarray,
+    what: str,
+    count: int | None = None,
 ) -> Int[np.ndarray, " n"]:
-    """Positions of `image`, `point` or `lens`, from positions, a mask, or the names of images. `count` is how many
-    there are; None: as images. Raises ValueError: it is none of these, or there are fewer; one line."""
+    """Positions of `image`, `point` or `lens`, from positions, a mask, or the names of images.
+    `count` is how many there are; None: as images. Raises ValueError: it is none of these, or there
+    are fewer; one line."""
     count = problem.num_cameras if count is None else count
     try:
         chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
@@ -125,7 +141,9 @@ def positions_of(
             raise ValueError(f"this problem has no names for a {what}: give positions")
         return problem.labels.positions("image", chosen.tolist())
     if chosen.size and chosen.dtype.kind not in "iu":
-        raise ValueError(f"each {what} is given by its position, not by {shown(chosen.tolist()[0])}")
+        raise ValueError(
+            f"each {what} is given by its position, not by {shown(chosen.tolist()[0])}"
+        )
     bad = chosen[(chosen < 0) | (chosen >= count)]
     if len(bad):
         raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
@@ -133,7 +151,8 @@ def positions_of(
 
 
 def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "lenses numbers"]:
-    """The numbers of each lens that names or groups mean. Raises ValueError: no lens has such a number; one line."""
+    """The numbers of each lens that names or groups mean. Raises ValueError: no lens has such a
+    number; one line."""
     free = np.asarray(lenses.free)
     meant = np.zeros(free.shape, bool)
     if not isinstance(numbers, Iterable):
@@ -146,9 +165,17 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
             for model in lenses.models
         ]
         if name not in GROUPS and not any(of_models):
-            known = dict.fromkeys(parameter for model in lenses.models for parameter in model.parameters)
-            raise ValueError(f"no lens has a number {shown(name)}; there are {', '.join([*GROUPS, *known])}")
+            known = dict.fromkeys(
+                parameter for model in lenses.models for parameter in model.parameters
+            )
+            raise ValueError(
+                f"no lens has a number {shown(name)}; there are {', '.join([*GROUPS, *known])}"
+            )
         for number, columns in enumerate(of_models):
-            own = np.zeros(len(free), int) == number if lenses.model is None else np.asarray(lenses.model) == number
+            own = (
+                np.zeros(len(free), int) == number
+                if lenses.model is None
+                else np.asarray(lenses.model) == number
+            )
             meant[np.ix_(own, columns)] = True
     return meant

@@ -1,4 +1,5 @@
-"""Names of images as other files have them: with other folders, case or endings than those of the problem."""
+"""Names of images as other files have them: with other folders, case or endings than those of the
+problem."""
 
 from __future__ import annotations
 
@@ -25,9 +26,10 @@ class NamedImages(NamedTuple):
 def named_images(wanted: Iterable[str], names: Sequence[str]) -> NamedImages:
     """Which images names of a file mean.
 
-    A name means the image that is called the same. If there is none, it means the image whose path ends in the same
-    part: between `/` or `\\`, then also in another case, then also with another ending (`.JPG`, `.tif`, or none). Where
-    several do, it is the one with most of the path in common. Another name for the same image must not be nearer to it.
+    A name means the image that is called the same. If there is none, it means the image whose path
+    ends in the same part: between `/` or `\\`, then also in another case, then also with another
+    ending (`.JPG`, `.tif`, or none). Where several do, it is the one with most of the path in
+    common. Another name for the same image must not be nearer to it.
 
     Args:
         wanted: names of a file.
@@ -60,7 +62,8 @@ def _match(
     form: Callable[[str], str],
     positions: dict[str, int],
 ) -> dict[str, str]:
-    """Adds the images of names whose last parts have the same form to `positions`; returns the doubts of others.
+    """Adds the images of names whose last parts have the same form to `positions`; returns the
+    doubts of others.
 
     Args:
         rest: names that have no image yet.
@@ -103,7 +106,8 @@ class _Paths:
                 self._ending[path[first:]].append(at)
 
     def nearest(self, path: tuple[str, ...]) -> list[int]:
-        """Those that have most of a path in common, from its end; of these the path itself, if it is there."""
+        """Those that have most of a path in common, from its end; of these the path itself, if it
+        is there."""
         for first in range(len(path)):
             alike = self._ending.get(path[first:], [])
             if alike:
@@ -121,7 +125,9 @@ def _path(name: str, form: Callable[[str], str]) -> tuple[str, ...]:
 
 def _parts(name: str) -> list[str]:
     """Folders and file of a name, without a drive of Windows."""
-    return [part for part in re.split(r"[/\\]", _DRIVE.sub("", name.strip())) if part not in ("", ".")]
+    return [
+        part for part in re.split(r"[/\\]", _DRIVE.sub("", name.strip())) if part not in ("", ".")
+    ]
 
 
 def _same_case(part: str) -> str:

@@ -1,7 +1,8 @@
-"""Lenses: which cameras share intrinsics, of which camera model they are, and which of their numbers are optimised.
+"""Lenses: which cameras share intrinsics, of which camera model they are, and which of their
+numbers are optimised.
 
-A *lens* is one set of intrinsics, which several cameras (images) can share. In BAL every camera has a lens of its own.
-In a COLMAP model all images of one physical camera share their intrinsics."""
+A *lens* is one set of intrinsics, which several cameras (images) can share. In BAL every camera has
+a lens of its own. In a COLMAP model all images of one physical camera share their intrinsics."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from jaxba.problem.checks import indices, plain_array
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 POSE_SIZE = 6
-"""Parameters of a pose: angle-axis (radians) and translation (scene units). Those of the lens follow in a camera."""
+"""Parameters of a pose: angle-axis (radians) and translation (scene units). Those of the lens
+follow in a camera."""
 
 LENS_SIZE = len(BAL)  # parameters of a BAL lens: f (pixels), k1, k2
 
@@ -26,7 +28,8 @@ class Lenses(ArrayRecord):
     """The lenses of a problem's cameras."""
 
     index: Int[AnyArray, " cameras"]
-    """Lens of each camera, int32. Cameras with the same lens have equal intrinsics, before and after a solve."""
+    """Lens of each camera, int32. Cameras with the same lens have equal intrinsics, before and
+    after a solve."""
 
     free: Bool[AnyArray, "lenses numbers"]
     """Which numbers of each lens are optimised: as many as the largest of the models has."""
@@ -62,20 +65,28 @@ def lens_size(lenses: Lenses | None) -> int:
 
 
 def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
-    """Checks the lenses of cameras and returns them as int32 and bool NumPy arrays. Raises ValueError: shapes differ,
-    an index is out of range, or cameras with the same lens differ in their intrinsics. The message is one line."""
+    """Checks the lenses of cameras and returns them as int32 and bool NumPy arrays. Raises
+    ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in
+    their intrinsics. The message is one line."""
     free, size = plain_array("free of lenses", lenses.free), lens_size(lenses)
     names = "f, k1 and k2" if lenses.all_bal else f"{size} numbers"
     if free.ndim != 2 or free.shape[1] != size or free.dtype != bool:
-        raise ValueError(f"lenses must say of {names} what is free, shape (n, {size}), not {free.dtype}{free.shape}")
+        raise ValueError(
+            f"lenses must say of {names} what is free, shape (n, {size}), not "
+            f"{free.dtype}{free.shape}"
+        )
     index = indices("the lens of cameras", lenses.index, len(free), len(cameras))
     given = np.zeros(len(free), int) if lenses.model is None else lenses.model
     model = indices("the model of lenses", given, len(lenses.models), len(free))
     beyond = np.arange(size) >= np.array([len(one) for one in lenses.models])[model][:, None]
     _, first, group = np.unique(index, return_index=True, return_inverse=True)
-    other = np.flatnonzero((cameras[first[group], POSE_SIZE:] != cameras[:, POSE_SIZE:]).any(axis=1))
+    other = np.flatnonzero(
+        (cameras[first[group], POSE_SIZE:] != cameras[:, POSE_SIZE:]).any(axis=1)
+    )
     if other.size:
         pair = f"{first[group[other[0]]]} and {other[0]}"
         differ = names.replace("and", "or") if lenses.all_bal else "their intrinsics"
         raise ValueError(f"cameras {pair} share lens {index[other[0]]}, but differ in {differ}")
-    return replace(lenses, index=index, free=free & ~beyond, model=None if lenses.model is None else model)
+    return replace(
+        lenses, index=index, free=free & ~beyond, model=None if lenses.model is None else model
+    )

@@ -1,4 +1,5 @@
-"""What a file calls the parts of a problem: names and ids of its images, ids of its lenses and points."""
+"""What a file calls the parts of a problem: names and ids of its images, ids of its lenses and
+points."""
 
 from __future__ import annotations
 
@@ -37,7 +38,11 @@ class Labels(ArrayRecord):
     def of(self, cameras: Any, points: Any) -> Labels:
         """Those of some cameras and points."""
         names = np.array(self.names, object)[cameras].tolist()
-        marks = [self.mark(at) for at in np.arange(len(self.points))[points].tolist()] if self.marks else []
+        marks = (
+            [self.mark(at) for at in np.arange(len(self.points))[points].tolist()]
+            if self.marks
+            else []
+        )
         return replace(
             self,
             names=tuple(names),
@@ -52,17 +57,23 @@ class Labels(ArrayRecord):
         return self.marks[number] if number >= 0 else ""
 
     def positions(self, kind: Part, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
-        """Positions of parts by id, of images also by name, as `named_images` understands it. Raises ValueError: there
-        is no such part, or there are several; one line."""
+        """Positions of parts by id, of images also by name, as `named_images` understands it.
+        Raises ValueError: there is no such part, or there are several; one line."""
         ids = {"image": self.images, "lens": self.lenses, "point": self.points}[kind]
         known: dict[int | str, int] = {number: at for at, number in enumerate(ids.tolist())}
         wanted = list(wanted)
-        named = named_images([one for one in wanted if isinstance(one, str) and kind == "image"], self.names)
+        named = named_images(
+            [one for one in wanted if isinstance(one, str) and kind == "image"], self.names
+        )
         known |= named.positions
         missing = [one for one in wanted if isinstance(one, bool) or one not in known]
         if missing:
             more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
-            example = f"; there is {self.names[0]!r}" if isinstance(missing[0], str) and kind == "image" else ""
+            example = (
+                f"; there is {self.names[0]!r}"
+                if isinstance(missing[0], str) and kind == "image"
+                else ""
+            )
             doubt = named.doubts.get(str(missing[0]), "")
             what = f"there is no {'camera' if kind == 'lens' else kind} {missing[0]!r}{more}"
             raise ValueError(doubt or what + example)
@@ -70,7 +81,8 @@ class Labels(ArrayRecord):
 
 
 def part_name(labels: Labels | None, kind: Part, at: Any) -> str:
-    """What a message calls a part of a problem: by its name and id, or by its position where nothing has labels."""
+    """What a message calls a part of a problem: by its name and id, or by its position where
+    nothing has labels."""
     if labels is None:
         return f"{'camera' if kind == 'image' else kind} {at}"
     if kind == "image":
@@ -80,7 +92,9 @@ def part_name(labels: Labels | None, kind: Part, at: Any) -> str:
     return f"point {labels.mark(int(at)) or labels.points[at]}"
 
 
-def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], named: int = 1) -> str:
+def part_names(
+    labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], named: int = 1
+) -> str:
     """The same for some parts of a kind; of more than `named` the first ones."""
     more = f" and {len(which) - named} more" if len(which) > named else ""
     return ", ".join(part_name(labels, kind, at) for at in which[:named]) + more

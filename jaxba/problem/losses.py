@@ -2,10 +2,12 @@
 
     f = 1/2 sum_i rho(|r_i|^2)
 
-In the normal equations residual and Jacobian are weighted by `sqrt(rho'(s))` (iteratively reweighted least squares).
-The second-derivative term of Triggs' correction is left out, so that every block stays positive semi-definite.
+In the normal equations residual and Jacobian are weighted by `sqrt(rho'(s))` (iteratively
+reweighted least squares). The second-derivative term of Triggs' correction is left out, so that
+every block stays positive semi-definite.
 
-Source: Ceres Solver, loss_function.h; Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis"."""
+Source: Ceres Solver, loss_function.h; Triggs et al. 2000, "Bundle Adjustment - A Modern
+Synthesis"."""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ def _soft_l1(s: Array) -> tuple[Array, Array]:
 def _tukey(s: Array) -> tuple[Array, Array]:
     inside = jnp.minimum(s, 1)
     value = inside * (1 - inside + inside**2 / 3)  # (1 - (1 - s)^3) / 3 without cancellation
-    return jnp.where(jnp.isfinite(s), value, s), (1 - inside) ** 2  # nan and inf must not pass as outliers
+    # nan and inf must not pass as outliers
+    return jnp.where(jnp.isfinite(s), value, s), (1 - inside) ** 2
 
 
 _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
@@ -53,8 +56,9 @@ NAMES = tuple(_SHAPES)  # names of the known losses
 class Loss:
     """A robust loss and its scale (pixels).
 
-    Instead of a name you can give a function `rho(s)`, elementwise in JAX, with `rho(0) = 0`, derivative 1 at zero and
-    no negative derivative; JAX differentiates it. Define the function once: another function object compiles again."""
+    Instead of a name you can give a function `rho(s)`, elementwise in JAX, with `rho(0) = 0`,
+    derivative 1 at zero and no negative derivative; JAX differentiates it. Define the function
+    once: another function object compiles again."""
 
     rho: str | Callable[[Array], Array] = "squared"
     """One of `squared`, `huber`, `soft_l1`, `cauchy`, `tukey`, or a function of `s / scale^2`."""
@@ -67,21 +71,26 @@ class Loss:
             raise ValueError(f"unknown loss {shown(self.rho)}; known: {', '.join(NAMES)}")
         scale = float(finite("scale", self.scale, ()))
         if not (scale > 0 and 0 < scale * scale < float("inf")):
-            raise ValueError(f"scale must be positive, and its square a finite number, is {self.scale}")
+            raise ValueError(
+                f"scale must be positive, and its square a finite number, is {self.scale}"
+            )
 
     @property
     def trivial(self) -> bool:
         """Whether this is the squared loss, with weight one everywhere."""
         return self.rho == "squared"
 
-    def __call__(self, squared: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def __call__(
+        self, squared: Float[Array, "..."]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """`rho(s)` (pixels^2) and `rho'(s)` at squared residual norms s (pixels^2)."""
         area = self.scale * self.scale
         if callable(self.rho):
             value, slope = jax.jvp(self.rho, (squared / area,), (jnp.ones_like(squared),))
             if value.shape != squared.shape:
                 raise ValueError(
-                    f"a loss is elementwise: {shown(self.rho)} of shape {squared.shape} gave {value.shape}"
+                    f"a loss is elementwise: {shown(self.rho)} of shape {squared.shape} gave "
+                    f"{value.shape}"
                 )
         else:
             value, slope = _SHAPES[self.rho](squared / area)

@@ -1,4 +1,5 @@
-"""Marks: surveyed points that a problem gets besides its own, with observations, and loses before it is written."""
+"""Marks: surveyed points that a problem gets besides its own, with observations, and loses before
+it is written."""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ def found_at(
     places: Float[np.ndarray, "n 3"],
     stddev: Float[np.ndarray, "n 3"],
 ) -> Found:
-    """How a problem has points that were measured at some places, to standard deviations along x, y and z."""
+    """How a problem has points that were measured at some places, to standard deviations along x, y
+    and z."""
     own = np.isin(np.asarray(problem.point_index), at)
     seen = problem.subset(own)
     squares = np.sum((np.asarray(seen.observations) - geometry.project(seen)) ** 2, axis=1)
@@ -84,7 +86,8 @@ def with_marks(
     sigma: float,
     names: tuple[str, ...],
 ) -> BundleProblem:
-    """A problem without constants with marks of some names as its last points, seen by images at pixels.
+    """A problem without constants with marks of some names as its last points, seen by images at
+    pixels.
 
     They start in the middle of what the first of their images sees.
 
@@ -96,14 +99,26 @@ def with_marks(
         sigma: standard deviation of each number of a pixel, pixels.
         names: names of the marks."""
     count = len(names)
-    points, camera, point = map(np.asarray, (problem.points, problem.camera_index, problem.point_index))
+    points, camera, point = map(
+        np.asarray, (problem.points, problem.camera_index, problem.point_index)
+    )
     seen = [points[point[camera == image[mark == one][0]]] for one in range(count)]
     starts = np.stack([np.median(own if len(own) else points, axis=0) for own in seen])
-    joined = lambda old, new: np.concatenate([np.asarray(old), np.asarray(new)]).astype(np.asarray(old).dtype)
-    changes: dict[str, Any] = {"points": joined(points, starts), "observations": joined(problem.observations, pixels)}
-    changes |= {"camera_index": joined(camera, image), "point_index": joined(point, mark + len(points))}
+    joined = lambda old, new: np.concatenate([np.asarray(old), np.asarray(new)]).astype(
+        np.asarray(old).dtype
+    )
+    changes: dict[str, Any] = {
+        "points": joined(points, starts),
+        "observations": joined(problem.observations, pixels),
+    }
+    changes |= {
+        "camera_index": joined(camera, image),
+        "point_index": joined(point, mark + len(points)),
+    }
     if problem.whitening is not None or sigma != 1.0:
-        changes["whitening"] = joined(whitening_of(problem), np.tile(np.eye(2) / sigma, (len(pixels), 1, 1)))
+        changes["whitening"] = joined(
+            whitening_of(problem), np.tile(np.eye(2) / sigma, (len(pixels), 1, 1))
+        )
     if (labels := problem.labels) is not None:
         ids = labels.points.max(initial=0) + 1 + np.arange(count)
         changes["labels"] = replace(labels, points=joined(labels.points, ids), marks=names)

@@ -1,4 +1,5 @@
-"""Priors of a problem from measurements: `with_position_priors`, `with_rotation_priors`, `with_lens_priors`.
+"""Priors of a problem from measurements: `with_position_priors`, `with_rotation_priors`,
+`with_lens_priors`.
 
 A scene is first aligned with measured positions, since its frame and scale are arbitrary."""
 
@@ -34,21 +35,22 @@ def with_position_priors(
     loss: Loss | None = None,
     align: bool = True,
 ) -> BundleProblem:
-    """The problem with measured positions of images. Raises ValueError: shapes, or no such image; one line. Raises
-    ProblemError: a covariance is not positive definite; or an alignment would move what is constant or has priors, or
-    the positions are latitude and longitude, or mirrored.
+    """The problem with measured positions of images. Raises ValueError: shapes, or no such image;
+    one line. Raises ProblemError: a covariance is not positive definite; or an alignment would move
+    what is constant or has priors, or the positions are latitude and longitude, or mirrored.
 
     Args:
         problem: any problem.
         positions: measured centres, shape (n, 3), in the units of `covariance`.
         covariance: shape (3, 3) for all, or (n, 3, 3).
-        stddev: standard deviations instead: one number, three along x, y and z, or one or three for each image, shape
-            (n, 1), (n, 3), or (n,) where n is not 3.
+        stddev: standard deviations instead: one number, three along x, y and z, or one or three for
+            each image, shape (n, 1), (n, 3), or (n,) where n is not 3.
         images: positions or names of the images; None: all, in order.
         loss: robust loss of the squared whitened distance; None: squared.
-        align: whether the scene is first moved, turned and scaled to the measured positions, robustly, as COLMAP does.
-            What they do not determine, such as the rotation about a line, stays as it is, with a `ProblemWarning`.
-            Without it the scene must be in their frame already."""
+        align: whether the scene is first moved, turned and scaled to the measured positions,
+            robustly, as COLMAP does. What they do not determine, such as the rotation about a line,
+            stays as it is, with a `ProblemWarning`. Without it the scene must be in their frame
+            already."""
     at = _images_at(problem, images)
     measured = finite("positions", positions, (len(at), 3))
     if (covariance is None) == (stddev is None):
@@ -60,19 +62,26 @@ def with_position_priors(
         raise ValueError(f"loss must be a jaxba.Loss, not {shown(loss)}")
     if align:
         if problem.constants is not None or problem.residuals:
-            raise ProblemError("an alignment would move what is constant or measured: align first, or align=False")
+            raise ProblemError(
+                "an alignment would move what is constant or measured: align first, or align=False"
+            )
         problem = aligned(problem, measured, covariances, at)
     rows = position_prior(pose=at, position=measured, whitening=roots)
     return _with(problem, replace(rows, loss=loss or Loss(), size=3, aligned=True))
 
 
 def with_rotation_priors(
-    problem: BundleProblem, rotations: Any, covariance: Any, *, images: Iterable[int] | Iterable[str] | None = None
+    problem: BundleProblem,
+    rotations: Any,
+    covariance: Any,
+    *,
+    images: Iterable[int] | Iterable[str] | None = None,
 ) -> BundleProblem:
-    """The problem, which is in the frame of the measurements, with measured rotations of images. `rotations` are
-    angle-axis from the world to the camera (BAL's axes, as in `problem.cameras`), shape (n, 3), radians. `covariance`
-    is that of the rotation in the camera's frame, radians squared, shape (3, 3) for all, or (n, 3, 3). `images` are as
-    for `with_position_priors`. Raises ValueError, ProblemError: as that does."""
+    """The problem, which is in the frame of the measurements, with measured rotations of images.
+    `rotations` are angle-axis from the world to the camera (BAL's axes, as in `problem.cameras`),
+    shape (n, 3), radians. `covariance` is that of the rotation in the camera's frame, radians
+    squared, shape (3, 3) for all, or (n, 3, 3). `images` are as for `with_position_priors`. Raises
+    ValueError, ProblemError: as that does."""
     at = _images_at(problem, images)
     measured = finite("rotations", rotations, (len(at), 3))
     whitening = AXES * _covariances(problem, "rotation", covariance, at)[1] * AXES[:, None]
@@ -82,14 +91,20 @@ def with_rotation_priors(
 
 
 def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> BundleProblem:
-    """The problem with its lenses' numbers believed as they are, to a standard deviation. `numbers` has the standard
-    deviation by the name of a number, such as `k1`, or of a group (`focal`, `principal_point`, `distortion`), in the
-    units of the number. Raises ValueError: no such number, or a standard deviation that is not positive; one line."""
+    """The problem with its lenses' numbers believed as they are, to a standard deviation. `numbers`
+    has the standard deviation by the name of a number, such as `k1`, or of a group (`focal`,
+    `principal_point`, `distortion`), in the units of the number. Raises ValueError: no such number,
+    or a standard deviation that is not positive; one line."""
     lenses = every_lens(problem)
     used, first = np.unique(lenses.index, return_index=True)
-    mean, weight = np.asarray(problem.cameras)[first, POSE_SIZE:], np.zeros(np.asarray(lenses.free).shape)
+    mean, weight = (
+        np.asarray(problem.cameras)[first, POSE_SIZE:],
+        np.zeros(np.asarray(lenses.free).shape),
+    )
     if not isinstance(numbers, dict):
-        raise ValueError(f"standard deviations are a dict by the names of numbers, not {shown(numbers)}")
+        raise ValueError(
+            f"standard deviations are a dict by the names of numbers, not {shown(numbers)}"
+        )
     for name, value in numbers.items():
         deviation = float(finite(f"the standard deviation of {name}", value, ()))
         if deviation <= 0:
@@ -136,7 +151,9 @@ def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str] | N
     at = positions_of(problem, images, "image")
     values, counts = np.unique(at, return_counts=True)
     if (counts > 1).any():
-        raise ValueError(f"{_name(problem, int(values[counts > 1][0]))} has more than one measurement")
+        raise ValueError(
+            f"{_name(problem, int(values[counts > 1][0]))} has more than one measurement"
+        )
     return at
 
 
@@ -157,12 +174,14 @@ def _variances(stddev: Any, count: int) -> Float[np.ndarray, "n 3 3"]:
 def _covariances(
     problem: BundleProblem, what: str, covariance: Any, at: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3 3"]]:
-    """A covariance for each image, and its inverse root. Raises ValueError: shapes; one line. Raises ProblemError: one
-    is not symmetric positive definite; it names the image."""
+    """A covariance for each image, and its inverse root. Raises ValueError: shapes; one line.
+    Raises ProblemError: one is not symmetric positive definite; it names the image."""
     given = finite(f"the covariance of a {what}", covariance, (3, 3), (len(at), 3, 3))
     matrices = np.broadcast_to(given, (len(at), 3, 3))
     roots, bad = inverse_roots(matrices, LEAST_VARIANCE)
     if len(bad):
         where = _name(problem, int(at[bad[0]]))
-        raise ProblemError(f"the covariance of the {what} of {where} is not symmetric positive definite")
+        raise ProblemError(
+            f"the covariance of the {what} of {where} is not symmetric positive definite"
+        )
     return matrices, roots

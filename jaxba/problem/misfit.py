@@ -1,4 +1,5 @@
-"""Which measured places a scene does not have, once it is aligned with them, and whether it then stands on its head."""
+"""Which measured places a scene does not have, once it is aligned with them, and whether it then
+stands on its head."""
 
 from __future__ import annotations
 
@@ -11,8 +12,9 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 
 BENDS = 0.03
-"""Share of its extent by which images alone may bend a scene, which a solve with what was measured mends. Not fitted:
-blocks of images without control points bow by about one percent, James and Robson 2014, doi:10.1002/esp.3609."""
+"""Share of its extent by which images alone may bend a scene, which a solve with what was measured
+mends. Not fitted: blocks of images without control points bow by about one percent, James and
+Robson 2014, doi:10.1002/esp.3609."""
 
 MISFIT = 5.0  # distance, over that of noise, from which places do not fit
 
@@ -23,10 +25,12 @@ LEAST = 5  # places of which one can be told apart: of four, any three fit nearl
 NAMED = 3  # places that a note names
 
 STEEP, NEARLY_ALL_IMAGES = 0.7, 0.9
-"""Cosine of an angle from the vertical within which images say what is up, and the share of them that must agree."""
+"""Cosine of an angle from the vertical within which images say what is up, and the share of them
+that must agree."""
 
 ON_ITS_HEAD = (
-    "the scene stands on its head, and would fit as well if an axis were mirrored: are two axes swapped, or is one "
+    "the scene stands on its head, and would fit as well if an axis were mirrored: are two axes "
+    "swapped, or is one "
     "reversed?"
 )
 """Note on places in a plane, which fit a scene that is turned over as well."""
@@ -35,7 +39,8 @@ ON_ITS_HEAD = (
 def off_by(
     away: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Lengths of differences from measured places, scene units, and the same in standard deviations."""
+    """Lengths of differences from measured places, scene units, and the same in standard
+    deviations."""
     white = np.linalg.solve(covariances, away[:, :, None])[:, :, 0]
     return np.linalg.norm(away, axis=1), np.sqrt(np.einsum("ni,ni->n", away, white))
 
@@ -46,9 +51,12 @@ def extent_of(places: Float[np.ndarray, "n 3"]) -> float:
 
 
 def wrong_places(
-    places: Float[np.ndarray, "n 3"], away: Float[np.ndarray, "n 3"], covariances: Float[np.ndarray, "n 3 3"]
+    places: Float[np.ndarray, "n 3"],
+    away: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
 ) -> Int[np.ndarray, " wrong"]:
-    """Measured places that neither noise nor a bent scene explains where the others fit; the largest first.
+    """Measured places that neither noise nor a bent scene explains where the others fit; the
+    largest first.
 
     Args:
         places: measured, scene units.
@@ -72,8 +80,13 @@ def wrong_text(
     distance, sigmas = off_by(away, covariances)
     named = []
     for at in wrong[:NAMED].tolist():
-        axes = ", ".join(f"{axis} {number:.3g}" for axis, number in zip("xyz", away[at].tolist(), strict=True))
-        named.append(f"{name(at)} is {distance[at]:.3g} from there ({axes}; {sigmas[at]:.3g} standard deviations)")
+        axes = ", ".join(
+            f"{axis} {number:.3g}" for axis, number in zip("xyz", away[at].tolist(), strict=True)
+        )
+        named.append(
+            f"{name(at)} is {distance[at]:.3g} from there ({axes}; {sigmas[at]:.3g} standard "
+            "deviations)"
+        )
     rest = f", and {len(wrong) - NAMED} more are" if len(wrong) > NAMED else ""
     return f"{', '.join(named)}{rest}"
 

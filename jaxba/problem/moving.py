@@ -11,7 +11,8 @@ from jaxba.problem.similarity import Similarity, transformed
 
 
 def moved(problem: BundleProblem, by: Similarity) -> BundleProblem:
-    """The problem after a similarity; constants are copied exactly. Its residuals are not moved with it."""
+    """The problem after a similarity; constants are copied exactly. Its residuals are not moved
+    with it."""
     scene = transformed(problem, by)
     rigs = problem.rigs if has_size(problem) else scene.rigs
     scene = scene.replace(rigs=rigs, residuals=problem.residuals)
@@ -20,14 +21,16 @@ def moved(problem: BundleProblem, by: Similarity) -> BundleProblem:
         return scene
     cameras = np.array(scene.cameras)
     held = np.asarray(constants.poses)
-    cameras[:, :POSE_SIZE] = np.where(held, np.asarray(problem.cameras)[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
+    cameras[:, :POSE_SIZE] = np.where(
+        held, np.asarray(problem.cameras)[:, :POSE_SIZE], cameras[:, :POSE_SIZE]
+    )
     points = np.where(np.asarray(constants.points)[:, None], problem.points, scene.points)
     return scene.replace(cameras=cameras, points=points)
 
 
 def has_size(problem: BundleProblem) -> bool:
-    """Whether a rig says how large the scene is: one with several cameras in a frame, of which one has a constant
-    place away from the middle of the rig."""
+    """Whether a rig says how large the scene is: one with several cameras in a frame, of which one
+    has a constant place away from the middle of the rig."""
     rigs = in_frames(problem).rigs
     if rigs is None:
         return False

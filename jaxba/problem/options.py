@@ -21,8 +21,10 @@ Intrinsics = Literal["free", "fixed"]
 LensStep = Literal["file", "pixels"]
 PointStarts = Literal["step", "rays"]
 
-DIAGONAL_MINIMUM = 1e-6  # smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal
-DIAGONAL_MAXIMUM = 1e32  # largest diagonal entry that damping multiplies. Source: Ceres max_lm_diagonal
+# smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal
+DIAGONAL_MINIMUM = 1e-6
+# largest diagonal entry that damping multiplies. Source: Ceres max_lm_diagonal
+DIAGONAL_MAXIMUM = 1e32
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,13 @@ class ConjugateGradients:
     """Preconditioner and stopping rule of conjugate gradients."""
 
     preconditioner: Preconditioner = "two-level"
-    """`schur-jacobi`: the block diagonal of the reduced camera system. `two-level`: the same, with a coarse correction
-    for the motion of clusters of cameras. `jacobi`: the camera blocks of the normal equations."""
+    """`schur-jacobi`: the block diagonal of the reduced camera system. `two-level`: the same, with
+    a coarse correction for the motion of clusters of cameras. `jacobi`: the camera blocks of the
+    normal equations."""
 
     forcing: float = 0.1
-    """Stop when `i (Q_i - Q_(i-1)) / Q_i` falls below this, for the quadratic model Q after iteration i. Source: Ceres'
-    default."""
+    """Stop when `i (Q_i - Q_(i-1)) / Q_i` falls below this, for the quadratic model Q after
+    iteration i. Source: Ceres' default."""
 
     tolerance: float = 0.0
     """Stop when the residual is below this fraction of the right-hand side; 0 switches it off."""
@@ -44,8 +47,8 @@ class ConjugateGradients:
     """Stop after this many iterations. Source: Ceres max_linear_solver_iterations."""
 
     budget: int = 12
-    """Iterations of the solver `cg`, which makes no fewer unless rounding ends them. Twelve is what the rule of the
-    others takes with the two-level preconditioner: 6 to 20 on real problems."""
+    """Iterations of the solver `cg`, which makes no fewer unless rounding ends them. Twelve is what
+    the rule of the others takes with the two-level preconditioner: 6 to 20 on real problems."""
 
     def __post_init__(self) -> None:
         check_known("preconditioner", self.preconditioner, Preconditioner)
@@ -58,28 +61,35 @@ class ConjugateGradients:
 
 @dataclass(frozen=True)
 class Refinement:
-    """Improvements of a step without another linear solve (`jaxba/refinement`). The default is none: plain LM."""
+    """Improvements of a step without another linear solve (`jaxba/refinement`). The default is
+    none: plain LM."""
 
     points: int = 0
     """Number of embedded point iterations for each candidate; 0 for none."""
 
     starts: PointStarts = "step"
-    """Start of embedded point iterations: `step`: the position after the step; `rays`: the midpoint of the rays of its
-    pixels if the cost is lower there, and both near convergence."""
+    """Start of embedded point iterations: `step`: the position after the step; `rays`: the midpoint
+    of the rays of its pixels if the cost is lower there, and both near convergence."""
 
     trials: int = 1
-    """Number of backtracking trials before a step is rejected; each is a quarter as long as the one before."""
+    """Number of backtracking trials before a step is rejected; each is a quarter as long as the one
+    before."""
 
     camera_rounds: int = 0
-    """Most rounds in which every camera, then every point is re-optimised on its own, after a step that achieved much
-    less than the predicted decrease; at most one for a backtracked candidate."""
+    """Most rounds in which every camera, then every point is re-optimised on its own, after a step
+    that achieved much less than the predicted decrease; at most one for a backtracked candidate."""
 
     pattern_moves: int = 0
-    """Most repetitions of an accepted step in its direction, each twice as far, if the linear model did not predict its
-    decrease or damping limited its length."""
+    """Most repetitions of an accepted step in its direction, each twice as far, if the linear model
+    did not predict its decrease or damping limited its length."""
 
     def __post_init__(self) -> None:
-        for name, least in (("points", 0), ("camera_rounds", 0), ("pattern_moves", 0), ("trials", 1)):
+        for name, least in (
+            ("points", 0),
+            ("camera_rounds", 0),
+            ("pattern_moves", 0),
+            ("trials", 1),
+        ):
             check_count(name, getattr(self, name), least)
         check_known("starts", self.starts, PointStarts)
 
@@ -89,16 +99,17 @@ class Coordinates:
     """Coordinates of a step, and the damping matrix D in them."""
 
     scaling: Scaling = "diagonal"
-    """Damping matrix: `diagonal`: `lambda diag(H)` with a clamped diagonal (Ceres); `identity`: `lambda I` (the paper
-    on learned damping)."""
+    """Damping matrix: `diagonal`: `lambda diag(H)` with a clamped diagonal (Ceres); `identity`:
+    `lambda I` (the paper on learned damping)."""
 
     rotation: Rotation = "angle-axis"
-    """Coordinates of a rotation step: `angle-axis`: addition to the angle-axis vector, as Ceres does with BAL cameras;
-    `manifold`: `R <- exp(step) R`. Diagonal damping differs between them."""
+    """Coordinates of a rotation step: `angle-axis`: addition to the angle-axis vector, as Ceres
+    does with BAL cameras; `manifold`: `R <- exp(step) R`. Diagonal damping differs between them."""
 
     lens_step: LensStep = "file"
-    """Coordinates in which a step of the intrinsics is added: `file`: f, k1 and k2, as Ceres does with BAL cameras;
-    `pixels`: f and the distortion per pixel, `k1 / f^2` and `k2 / f^4`. They agree to first order."""
+    """Coordinates in which a step of the intrinsics is added: `file`: f, k1 and k2, as Ceres does
+    with BAL cameras; `pixels`: f and the distortion per pixel, `k1 / f^2` and `k2 / f^4`. They
+    agree to first order."""
 
     def __post_init__(self) -> None:
         for name, known in (("scaling", Scaling), ("rotation", Rotation), ("lens_step", LensStep)):
@@ -106,13 +117,15 @@ class Coordinates:
 
 
 class MethodTraits:
-    """What layout and compilation know of a method that computes the step (`lm.method.StepMethod`)."""
+    """What layout and compilation know of a method that computes the step
+    (`lm.method.StepMethod`)."""
 
     name: str
     """Name in commands, tables and files."""
 
     forms_reduced_system: bool = False
-    """Whether it forms the reduced camera system, so that the layout must list pairs of observations."""
+    """Whether it forms the reduced camera system, so that the layout must list pairs of
+    observations."""
 
     cluster_cameras: int | None = None
     """Largest number of cameras in a random cluster; None for a method without clusters."""
@@ -126,12 +139,14 @@ class StepOptions:
     """Static options of `lm_step`. Each distinct value compiles a program of its own."""
 
     linear_solver: LinearSolver = "explicit"
-    """Solver of the reduced camera system. `explicit`: form and factor it. `sparse`: form its blocks, then conjugate
-    gradients. `implicit`: conjugate gradients without forming it. `cg`: the same by `jax.scipy.sparse.linalg.cg`, with
-    a fixed number of iterations. Ignored by methods, which have their own."""
+    """Solver of the reduced camera system. `explicit`: form and factor it. `sparse`: form its
+    blocks, then conjugate gradients. `implicit`: conjugate gradients without forming it. `cg`: the
+    same by `jax.scipy.sparse.linalg.cg`, with a fixed number of iterations. Ignored by methods,
+    which have their own."""
 
     method: MethodTraits | None = None
-    """Method that replaces the plain Levenberg-Marquardt step, an entry of `jaxba.METHODS`; None: plain LM."""
+    """Method that replaces the plain Levenberg-Marquardt step, an entry of `jaxba.METHODS`; None:
+    plain LM."""
 
     conjugate_gradients: ConjugateGradients = field(default_factory=ConjugateGradients)
     """Conjugate gradients of the solvers `sparse`, `implicit` and `cg`."""
@@ -149,8 +164,9 @@ class StepOptions:
     """Robust loss of the squared whitened residual."""
 
     mixed_precision: bool = False
-    """Whether the reduced camera system is float32, with everything else in the type of the parameters. A factorisation
-    is then the preconditioner of a few conjugate gradient iterations in full precision."""
+    """Whether the reduced camera system is float32, with everything else in the type of the
+    parameters. A factorisation is then the preconditioner of a few conjugate gradient iterations in
+    full precision."""
 
     def __post_init__(self) -> None:
         check_known("linear_solver", self.linear_solver, LinearSolver)
@@ -168,19 +184,22 @@ class StepOptions:
 
     @property
     def forms_reduced_system(self) -> bool:
-        """Whether blocks of the reduced camera system are formed, so that the layout must list pairs."""
+        """Whether blocks of the reduced camera system are formed, so that the layout must list
+        pairs."""
         if self.method:
             return self.method.forms_reduced_system
         return self.linear_solver in ("explicit", "sparse")
 
     @property
     def cluster_cameras(self) -> int | None:
-        """Largest number of cameras in a random cluster; None if the layout needs no random clusters."""
+        """Largest number of cameras in a random cluster; None if the layout needs no random
+        clusters."""
         return self.method.cluster_cameras if self.method else None
 
     @property
     def truncated(self) -> ConjugateGradients | None:
-        """Conjugate gradients that stop by a forcing term (inexact Newton); None if the step does not use them."""
+        """Conjugate gradients that stop by a forcing term (inexact Newton); None if the step does
+        not use them."""
         if self.method:
             return self.method.conjugate_gradients
         return None if self.linear_solver == "explicit" else self.conjugate_gradients
@@ -199,7 +218,8 @@ def check_known(name: str, value: Any, kind: Any) -> None:
 
 
 def check_count(name: str, value: Any, least: int) -> None:
-    """Raises ValueError: an option is no integer in [least, `LARGEST_COUNT`]; the message contains its name."""
+    """Raises ValueError: an option is no integer in [least, `LARGEST_COUNT`]; the message contains
+    its name."""
     try:
         count = operator.index(value)
     except TypeError:
@@ -211,8 +231,8 @@ def check_count(name: str, value: Any, least: int) -> None:
 
 
 def check_limit(name: str, value: Any) -> None:
-    """Raises ValueError: an option is neither None, which is no limit, nor a positive number; one line with its
-    name."""
+    """Raises ValueError: an option is neither None, which is no limit, nor a positive number; one
+    line with its name."""
     if value is not None and not real_number(name, value) > 0:
         raise ValueError(f"{name} must be positive, is {value}")
 

@@ -1,4 +1,5 @@
-"""A part of a problem: some of its images, as after each new image of an incremental reconstruction.
+"""A part of a problem: some of its images, as after each new image of an incremental
+reconstruction.
 
 Everything keeps its place and its labels, so that the whole can be written with what was found."""
 
@@ -15,8 +16,8 @@ from jaxba.problem.options import check_count
 from jaxba.problem.preprocess import observed
 
 FEW = 0.5
-"""Share of observed cameras, or points, below which a problem is solved without the others: their rows in the reduced
-camera system, and their places in the arrays, cost more than the copies."""
+"""Share of observed cameras, or points, below which a problem is solved without the others: their
+rows in the reduced camera system, and their places in the arrays, cost more than the copies."""
 
 
 def part(
@@ -29,9 +30,10 @@ def part(
 ) -> BundleProblem:
     """The problem of some images, with all else as it is.
 
-    What `images` see counts, and what others see of `points`; those others are constant, and so are lenses that no
-    chosen image has. A point that is seen by more images than count is constant, unless it is one of `points`. Source:
-    COLMAP, `BundleAdjustmentConfig` and `AddImageToProblem`, `AddPointToProblem`.
+    What `images` see counts, and what others see of `points`; those others are constant, and so are
+    lenses that no chosen image has. A point that is seen by more images than count is constant,
+    unless it is one of `points`. Source: COLMAP, `BundleAdjustmentConfig` and `AddImageToProblem`,
+    `AddPointToProblem`.
 
     Args:
         problem: any problem; its other residuals stay.
@@ -40,11 +42,14 @@ def part(
         ignored: points that do not count.
         min_track: fewest observations of a point, in all of the problem, with which it counts.
 
-    Raises ValueError: no such image or point, or no count. Raises NothingObserved, a ProblemError: nothing is left."""
+    Raises ValueError: no such image or point, or no count. Raises NothingObserved, a ProblemError:
+        nothing is left."""
     check_count("min_track", min_track, 0)
     camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     mine = mask_of(problem, images, problem.num_cameras, "image")
-    whole, dropped = (mask_of(problem, which, problem.num_points, "point") for which in (points, ignored))
+    whole, dropped = (
+        mask_of(problem, which, problem.num_points, "point") for which in (points, ignored)
+    )
     tracks = np.bincount(point, minlength=problem.num_points)
     counts = (mine[camera] | whole[point]) & ~dropped[point] & (tracks >= min_track)[point]
     if not counts.any():
@@ -68,7 +73,8 @@ class Observed(NamedTuple):
     points: Int[np.ndarray, " seen"]
 
     def whole(self, of: BundleProblem, found: BundleProblem) -> BundleProblem:
-        """The whole problem with the parameters found of this one. Cameras that nothing sees follow their lens."""
+        """The whole problem with the parameters found of this one. Cameras that nothing sees follow
+        their lens."""
         if self.problem is of:
             return found
         cameras, points = np.array(of.cameras, np.float64), np.array(of.points, np.float64)
@@ -76,14 +82,18 @@ class Observed(NamedTuple):
         lens = np.asarray(every_lens(of).index)
         used, first = np.unique(lens[self.cameras], return_index=True)
         follows = np.isin(lens, used)
-        cameras[follows, 6:] = cameras[self.cameras[first[np.searchsorted(used, lens[follows])]], 6:]
+        cameras[follows, 6:] = cameras[
+            self.cameras[first[np.searchsorted(used, lens[follows])]], 6:
+        ]
         return of.replace(cameras=cameras, points=points)
 
 
 def observed_part(problem: BundleProblem) -> Observed:
-    """The observed part of a problem, if that is few of its cameras or points; all of it otherwise, and with rigs and
-    residuals, which say more of cameras than pixels do."""
-    every = Observed(problem, *(np.arange(count) for count in (problem.num_cameras, problem.num_points)))
+    """The observed part of a problem, if that is few of its cameras or points; all of it otherwise,
+    and with rigs and residuals, which say more of cameras than pixels do."""
+    every = Observed(
+        problem, *(np.arange(count) for count in (problem.num_cameras, problem.num_points))
+    )
     if problem.rigs is not None or problem.residuals:
         return every
     cameras, points = map(np.flatnonzero, observed(problem))

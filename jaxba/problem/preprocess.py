@@ -12,14 +12,17 @@ from jaxba.problem.row_owners import block_groups, owners_of
 from jaxba.problem.similarity import Similarity, transformed
 
 FAR = 10.0
-"""Distance of a scene from the origin, relative to its extent, from which it is solved around the origin. BAL rotations
-are about the origin: far from it, small rotations are large motions, which distorts the damping and loses digits."""
+"""Distance of a scene from the origin, relative to its extent, from which it is solved around the
+origin. BAL rotations are about the origin: far from it, small rotations are large motions, which
+distorts the damping and loses digits."""
 
-MIN_TRACK = 2  # fewest observations that determine a point. Source: rootba, which drops points with fewer
+# fewest observations that determine a point. Source: rootba, which drops points with fewer
+MIN_TRACK = 2
 
 
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
-    """The marginal median of the points if a scene is far from the origin, as georeferenced scenes are; else zero.
+    """The marginal median of the points if a scene is far from the origin, as georeferenced scenes
+    are; else zero.
 
     "Far" is more than `FAR` times the extent. In scene units."""
     middle, extent = middle_and_extent(problem)
@@ -28,8 +31,9 @@ def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
 
 
 def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], float]:
-    """The marginal median of the observed points, of the cameras if there are none as in a pose graph, and the larger
-    of the median distances of points and of cameras from it, scene units; zeros if nothing is observed."""
+    """The marginal median of the observed points, of the cameras if there are none as in a pose
+    graph, and the larger of the median distances of points and of cameras from it, scene units;
+    zeros if nothing is observed."""
     cameras, points = observed(problem)
     with np.errstate(all="ignore"):  # a scene that overflows is rejected later, with a message
         positions = np.asarray(problem.points, np.float64)[points]
@@ -41,7 +45,9 @@ def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], f
         return middle, max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in places)
 
 
-def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool[np.ndarray, " points"]]:
+def observed(
+    problem: BundleProblem,
+) -> tuple[Bool[np.ndarray, " cameras"], Bool[np.ndarray, " points"]]:
     """Whether each camera, and each point, has an observation or a row of another residual."""
     cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
     points = np.bincount(problem.point_index, minlength=problem.num_points) > 0
@@ -56,7 +62,8 @@ def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:
-    """The same scene translated by an offset, scene units, but for cameras and points without observations."""
+    """The same scene translated by an offset, scene units, but for cameras and points without
+    observations."""
     if not np.any(offset):
         return problem
     return transformed(problem, Similarity(1.0, np.eye(3), offset), *observed(problem))
@@ -69,11 +76,12 @@ def perturb(
     translation_sigma: float = 0.0,
     point_sigma: float = 0.0,
 ) -> BundleProblem:
-    """Adds Gaussian noise to the start of a problem; the observations stay. Raises ProblemError: a sigma is negative or
-    not finite. Source: Ceres `BALProblem::Perturb`.
+    """Adds Gaussian noise to the start of a problem; the observations stay. Raises ProblemError: a
+    sigma is negative or not finite. Source: Ceres `BALProblem::Perturb`.
 
-    As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held fixed, then translation
-    noise is added to `t = -R c`. rootba adds it to c: the same distribution.
+    As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held
+    fixed, then translation noise is added to `t = -R c`. rootba adds it to c: the same
+    distribution.
 
     Args:
         problem: the problem to perturb.
@@ -81,7 +89,11 @@ def perturb(
         rotation_sigma: radians, on each component of the angle-axis vector.
         translation_sigma: scene units, on each component.
         point_sigma: scene units, on each coordinate."""
-    for name, sigma in (("rotation", rotation_sigma), ("translation", translation_sigma), ("point", point_sigma)):
+    for name, sigma in (
+        ("rotation", rotation_sigma),
+        ("translation", translation_sigma),
+        ("point", point_sigma),
+    ):
         if not 0 <= real_number(f"{name}_sigma", sigma) < np.inf:
             raise ProblemError(f"{name}_sigma must not be negative, got {sigma}")
     rng = random_numbers(seed)

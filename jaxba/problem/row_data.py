@@ -1,7 +1,7 @@
 """What data of residuals may be: their shape in one row, and which values make sense.
 
-The residuals of `jaxba.residuals` know it of each of their keywords (`with_data`), files of constraints check with the
-same functions."""
+The residuals of `jaxba.residuals` know it of each of their keywords (`with_data`), files of
+constraints check with the same functions."""
 
 from __future__ import annotations
 
@@ -62,8 +62,11 @@ class Datum:
         """Rows whose values it may not be."""
         return [] if self.holds is None else np.flatnonzero(~self.holds(values)).tolist()
 
-    def rows_of(self, name: str, values: Float[np.ndarray, "..."], count: int) -> Float[np.ndarray, "count ..."]:
-        """The values in each row. Raises ValueError: they are neither one value nor one a row; one line.
+    def rows_of(
+        self, name: str, values: Float[np.ndarray, "..."], count: int
+    ) -> Float[np.ndarray, "count ..."]:
+        """The values in each row. Raises ValueError: they are neither one value nor one a row; one
+        line.
 
         Args:
             name: of the keyword and its residual, for messages.
@@ -91,7 +94,9 @@ def other_length(name: str, length: int, count: int) -> str:
 
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    return len(shape) == len(wanted) and all(n in (m, ANY) for n, m in zip(wanted, shape, strict=True))
+    return len(shape) == len(wanted) and all(
+        n in (m, ANY) for n, m in zip(wanted, shape, strict=True)
+    )
 
 
 def _written(shape: tuple[int, ...]) -> str:

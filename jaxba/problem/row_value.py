@@ -15,12 +15,13 @@ from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Rows
 from jaxba.rotations import angle_axis
 from jaxba.typing import AnyArray
 
-AXES = np.array([1.0, -1.0, -1.0])  # from BAL's camera, which looks down -z with y up, to the axes of `Pose`
+# from BAL's camera, which looks down -z with y up, to the axes of `Pose`
+AXES = np.array([1.0, -1.0, -1.0])
 
 
 class Pose(NamedTuple):
-    """The pose of an image as functions of residuals see it: `P = R X + t` in the axes of COLMAP and OpenCV, x to the
-    right, y down, z forward."""
+    """The pose of an image as functions of residuals see it: `P = R X + t` in the axes of COLMAP
+    and OpenCV, x to the right, y down, z forward."""
 
     rotation: Float[Array, "3 3"]
     """R, from the world to the camera."""
@@ -48,7 +49,8 @@ class Pose(NamedTuple):
 
 
 def times(matrix: Float[AnyArray, "m n"], vector: Float[AnyArray, " n"]) -> Array:
-    """The product with a vector, term by term, which XLA fuses with what surrounds it. Raises IndexError: no matrix."""
+    """The product with a vector, term by term, which XLA fuses with what surrounds it. Raises
+    IndexError: no matrix."""
     return sum(matrix[:, k] * vector[k] for k in range(len(vector)))  # pyright: ignore[reportReturnType]
 
 
@@ -62,8 +64,11 @@ class Lens(NamedTuple):
     models: tuple[CameraModel, ...]
 
     def project(self, ray: Float[Array, "3"]) -> Float[Array, "2"]:
-        """The pixel of a point in the frame of the camera (`Pose.to_camera`), as `BundleProblem.observations`."""
-        every = [jnp.stack(one.project(list(self.numbers[: len(one)]), *ray)) for one in self.models]
+        """The pixel of a point in the frame of the camera (`Pose.to_camera`), as
+        `BundleProblem.observations`."""
+        every = [
+            jnp.stack(one.project(list(self.numbers[: len(one)]), *ray)) for one in self.models
+        ]
         return every[0] if len(every) == 1 else jnp.stack(every)[self.model]
 
 
@@ -84,15 +89,20 @@ def value(
     blocks: Sequence[Float[Array, "cameras _"]],
     data: Sequence[Array],
 ) -> Float[Array, " size"]:
-    """The function of a residual at one row; `rows` has the function, and the frame that it sees. Cameras and points
-    are those of the row, points anything if it has none. `blocks` has for each unknown of the function its block, of
-    each camera, and `data` for each keyword of the function its value."""
+    """The function of a residual at one row; `rows` has the function, and the frame that it sees.
+    Cameras and points are those of the row, points anything if it has none. `blocks` has for each
+    unknown of the function its block, of each camera, and `data` for each keyword of the function
+    its value."""
     dtype = cameras.translation.dtype
-    scale, turn, shift, axes = (jnp.asarray(x, dtype) for x in (rows.scale, rows.rotation, rows.translation, AXES))
+    scale, turn, shift, axes = (
+        jnp.asarray(x, dtype) for x in (rows.scale, rows.rotation, rows.translation, AXES)
+    )
     arguments: list[Any] = []
     for name, block in zip(rows.residual.unknowns, blocks, strict=True):
         base = name.removesuffix(SECOND)
-        which = int(name.endswith(SECOND) and len(points if base == POINT else cameras.rotation) > 1)
+        which = int(
+            name.endswith(SECOND) and len(points if base == POINT else cameras.rotation) > 1
+        )
         if base == POINT:
             arguments.append(scale * times(turn, points[which]) + shift)
         elif base == POSE:

@@ -1,8 +1,9 @@
 """Square roots and quotients whose derivatives are finite wherever their values are.
 
-The derivative of `sqrt` at zero is infinite, and `jnp.where` does not hide it: reverse differentiation multiplies it by
-the zero of the branch that was not taken, which gives NaN. So the operand is replaced before the operation where its
-value does not matter. Values are those of the plain operations, bit by bit."""
+The derivative of `sqrt` at zero is infinite, and `jnp.where` does not hide it: reverse
+differentiation multiplies it by the zero of the branch that was not taken, which gives NaN. So the
+operand is replaced before the operation where its value does not matter. Values are those of the
+plain operations, bit by bit."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def safe_divide(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`x / y`; where y is zero it is infinite or NaN as always, and a constant to differentiation."""
+    """`x / y`; where y is zero it is infinite or NaN as always, and a constant to
+    differentiation."""
     zero = y == 0
     return jnp.where(zero, lax.stop_gradient(x / y), x / jnp.where(zero, jnp.ones_like(y), y))

@@ -1,4 +1,5 @@
-"""The least-squares similarity between two sets of positions, whole or as far as a line determines it."""
+"""The least-squares similarity between two sets of positions, whole or as far as a line determines
+it."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from jaxba.problem.geometry import angle_axis, camera_poses, rotation_matrices
 Poses = Float[np.ndarray, "poses 3 4"]
 """Camera-to-world poses `[R | c]`."""
 
-LEAST_SPREAD = 1e-12  # second singular value of the covariance over the first, below which positions lie on a line
+# second singular value of the covariance over the first, below which positions lie on a line
+LEAST_SPREAD = 1e-12
 SAME_LINE = 1e-12  # sine of the angle below which two unit vectors are taken to lie on one line
 
 
@@ -35,7 +37,8 @@ class Similarity(NamedTuple):
 
 
 def upright(problem: BundleProblem) -> Similarity:
-    """The similarity to a scene around the origin, of a size of about one, with cameras' mean up along +z."""
+    """The similarity to a scene around the origin, of a size of about one, with cameras' mean up
+    along +z."""
     poses, points = camera_poses(problem.cameras), np.asarray(problem.points)
     places = np.concatenate([poses[:, :, 3], points])
     places = places[np.isfinite(places).all(axis=1)]
@@ -67,14 +70,19 @@ def transformed(
     cameras[seen, 3:6] = scale * cameras[seen, 3:6] - matrices @ shift
     points[placed] = by.points(points[placed])
     rigs = rigs if rigs is None or scale == 1.0 else rigs.scaled(scale)
-    return problem.replace(cameras=cameras, points=points, rigs=rigs, residuals=problem.residuals.moved(*by))
+    return problem.replace(
+        cameras=cameras, points=points, rigs=rigs, residuals=problem.residuals.moved(*by)
+    )
 
 
 def umeyama(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    weights: Float[np.ndarray, " n"] | None = None,
 ) -> Similarity:
-    """The least-squares similarity from `source` to `target`, with weights of the squared distances. Raises
-    ProblemError: fewer than three points, or all of them at one position or on one line.
+    """The least-squares similarity from `source` to `target`, with weights of the squared
+    distances. Raises ProblemError: fewer than three points, or all of them at one position or on
+    one line.
 
     Source: Umeyama 1991, eqs. 38-42; evo's `geometry.umeyama_alignment` is the same."""
     if len(source) < 3:
@@ -85,10 +93,14 @@ def umeyama(
     with np.errstate(over="ignore", invalid="ignore"):
         covariance, square = (shares[:, None] * b).T @ a, shares @ (a * a).sum(axis=1)
     if not (np.isfinite(covariance).all() and np.isfinite(square)):
-        raise ProblemError("the trajectories cannot be aligned: positions are too far apart to be squared")
+        raise ProblemError(
+            "the trajectories cannot be aligned: positions are too far apart to be squared"
+        )
     u, d, vt = np.linalg.svd(covariance)
     if not d[1] > LEAST_SPREAD * d[0]:
-        raise ProblemError("the trajectories cannot be aligned: the positions of one lie on a straight line")
+        raise ProblemError(
+            "the trajectories cannot be aligned: the positions of one lie on a straight line"
+        )
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
     scale = float((d * sign).sum() / square)
@@ -96,10 +108,13 @@ def umeyama(
 
 
 def along_line(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"]
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    weights: Float[np.ndarray, " n"],
 ) -> Similarity:
-    """The similarity that takes the line through `source` to that through `target`, by the smallest rotation, without a
-    turn about it. Arguments as for `umeyama`; the points of neither may be at one place."""
+    """The similarity that takes the line through `source` to that through `target`, by the smallest
+    rotation, without a turn about it. Arguments as for `umeyama`; the points of neither may be at
+    one place."""
     shares = weights / weights.sum()
     mean_source, mean_target = shares @ source, shares @ target
     a = source - mean_source
@@ -111,11 +126,14 @@ def along_line(
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
 
 
-def smallest_rotation(source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation by the smallest angle that takes one unit vector to another; where they are opposite, one of them.
+def smallest_rotation(
+    source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation by the smallest angle that takes one unit vector to another; where they are
+    opposite, one of them.
 
-    SciPy's `Rotation.align_vectors` is wrong by 1e-5 between vectors that are so far from opposite, on some processors.
-    """
+    SciPy's `Rotation.align_vectors` is wrong by 1e-5 between vectors that are so far from opposite,
+    on some processors."""
     cosine = source @ target
     across = target - cosine * source
     if np.linalg.norm(across) < SAME_LINE:

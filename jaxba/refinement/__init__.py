@@ -1,1 +1,2 @@
-"""What follows the linear solve: accept decision, point and camera refinement, backtracking, pattern moves."""
+"""What follows the linear solve: accept decision, point and camera refinement, backtracking,
+pattern moves."""

@@ -1,13 +1,15 @@
 """The accept decision on a candidate, after its embedded point iterations.
 
-With the cost f, the candidate x' and the decrease that the linear model predicts, a candidate is accepted if
+With the cost f, the candidate x' and the decrease that the linear model predicts, a candidate is
+accepted if
 
     f(x') < f(x)   and   rho = (f(x) - f(x')) / predicted > min_gain
 
 and no focal length changes its sign (`retraction.keep_focal_signs`).
 
-Source of the gain ratio rho: Nielsen 1999, "Damping Parameter in Marquardt's Method"; of embedded point iterations:
-Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment"."""
+Source of the gain ratio rho: Nielsen 1999, "Damping Parameter in Marquardt's Method"; of embedded
+point iterations: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle
+Adjustment"."""
 
 from __future__ import annotations
 
@@ -28,14 +30,18 @@ from jaxba.structure.devices import kept, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import total
 
-NEGLIGIBLE = 1e-6  # relative predicted decrease below which are no camera rounds or further trials. Source: Ceres
+# relative predicted decrease below which are no camera rounds or further trials. Source: Ceres
+NEGLIGIBLE = 1e-6
 
 POINT_DECREASE = 1e-2
-"""Candidates after the full step stop their point iterations once one lowers the cost by less than this part of the
-prediction. Not the full step: `ceres+refine3` would take 34 instead of 22 iterations to 1e-3 on kitti00vo."""
+"""Candidates after the full step stop their point iterations once one lowers the cost by less than
+this part of the prediction. Not the full step: `ceres+refine3` would take 34 instead of 22
+iterations to 1e-3 on kitti00vo."""
 
-NEAR_CONVERGENCE = 1e-3  # predicted decrease, relative to the cost, below which both starts of points are refined
-COST_ROUNDING = 8.0  # relative rounding error of a cost in machine epsilons: 1e-6 in float32, 2e-15 in float64
+# predicted decrease, relative to the cost, below which both starts of points are refined
+NEAR_CONVERGENCE = 1e-3
+# relative rounding error of a cost in machine epsilons: 1e-6 in float32, 2e-15 in float64
+COST_ROUNDING = 8.0
 
 
 class Step(NamedTuple):
@@ -43,8 +49,10 @@ class Step(NamedTuple):
 
     cameras: Float[Array, "parameters cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
-    slope: Float[Array, ""]  # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2
-    damped: Float[Array, ""]  # -g.d - d.H d, which is d.D d if the step solves the damped system; pixels^2
+    # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2
+    slope: Float[Array, ""]
+    # -g.d - d.H d, which is d.D d if the step solves the damped system; pixels^2
+    damped: Float[Array, ""]
     gradient_max: Float[Array, ""]  # largest absolute gradient entry before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
     forcing: Float[Array, ""]  # forcing term that stopped them; 0 for an exact solve
@@ -52,8 +60,8 @@ class Step(NamedTuple):
     def predicted(self, fraction: Float[Array, ""]) -> Float[Array, ""]:
         """Decrease of the cost that the linear model predicts for `fraction * d`, pixels^2.
 
-        `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not negative, so that
-        nothing cancels."""
+        `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not
+        negative, so that nothing cancels."""
         return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
 
 
@@ -63,7 +71,8 @@ class Candidate(NamedTuple):
     cameras: Float[Array, "parameters cameras"]
     points: Float[Array, "3 points"]  # scene units
     cost: Float[Array, ""]  # pixels^2
-    predicted: Float[Array, ""]  # decrease that the linear model predicts for this step fraction, pixels^2
+    # decrease that the linear model predicts for this step fraction, pixels^2
+    predicted: Float[Array, ""]
     gain: Float[Array, ""]  # actual over predicted decrease
     accepted: Bool[Array, ""]
     step_fraction: Float[Array, ""]  # length relative to the full step
@@ -76,15 +85,16 @@ class Comparison(NamedTuple):
     layout: Layout
     cameras: Float[Array, "parameters cameras"]  # before the step
     cost: Float[Array, ""]  # before the step, pixels^2
-    # terms of that cost, of points if points are refined, else of slots; differences are summed, since the difference
-    # of sums cancels in float32
+    # terms of that cost, of points if points are refined, else of slots; differences are summed,
+    # since the difference of sums cancels in float32
     terms: Float[Array, " terms"]
     previous: PreviousPoints  # before the step; diverged points return there
     step: Step  # the full step
     options: StepOptions
     min_gain: float | Float[Array, ""]  # gain ratio that an accepted candidate must exceed
     starts: Int[Array, ""]  # starts of points after the full step (`midpoints.refine_from_starts`)
-    matters: Bool[Array, ""]  # whether the predicted decrease is worth camera rounds and further trials
+    # whether the predicted decrease is worth camera rounds and further trials
+    matters: Bool[Array, ""]
 
 
 def comparison(
@@ -97,7 +107,8 @@ def comparison(
     options: StepOptions,
     min_gain: float | Float[Array, ""],
 ) -> Comparison:
-    """The `Comparison` of a step from current cameras and points, whose cost, costs of slots and depths are known."""
+    """The `Comparison` of a step from current cameras and points, whose cost, costs of slots and
+    depths are known."""
     predicted = step.predicted(jnp.ones_like(cost))
     matters = predicted > NEGLIGIBLE * cost
     previous = kept(layout, PreviousPoints.of(layout, points, reference))
@@ -124,16 +135,20 @@ def assess(
     repairs: Int[Array, ""],
     full_step: Bool[Array, ""],
 ) -> Candidate:
-    """Refines the points of a candidate, given before their embedded iterations, and decides whether it is accepted.
-    `step_fraction` scales the predicted decrease. `repairs` are camera rounds, trials and pattern moves until then,
-    with this one. `full_step`: whether this is the full step, after which points may also start from their rays."""
+    """Refines the points of a candidate, given before their embedded iterations, and decides
+    whether it is accepted. `step_fraction` scales the predicted decrease. `repairs` are camera
+    rounds, trials and pattern moves until then, with this one. `full_step`: whether this is the
+    full step, after which points may also start from their rays."""
     layout = against.layout
     predicted = against.step.predicted(step_fraction)
     points, terms = _refined(against, cameras, points, predicted, full_step)
-    cost, decrease = (sum_over_devices(layout, total(each)) for each in (terms, against.terms - terms))
+    cost, decrease = (
+        sum_over_devices(layout, total(each)) for each in (terms, against.terms - terms)
+    )
     gain = safe_divide(decrease, predicted)
     accepted = (decrease > 0) & (cost <= against.cost) & (predicted > 0) & (gain > against.min_gain)
-    # costs before and after come from two computations: a decrease that nothing predicts may be their rounding alone
+    # costs before and after come from two computations: a decrease that nothing predicts may be
+    # their rounding alone
     rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
     accepted = accepted & ((predicted > rounding) | (decrease > COST_ROUNDING * rounding))
     accepted = accepted & jnp.isfinite(cost) & jnp.all(keep_focal_signs(against.cameras, cameras))
@@ -141,13 +156,25 @@ def assess(
 
 
 def _refined(
-    against: Comparison, cameras: Array, points: Array, predicted: Float[Array, ""], full_step: Bool[Array, ""]
+    against: Comparison,
+    cameras: Array,
+    points: Array,
+    predicted: Float[Array, ""],
+    full_step: Bool[Array, ""],
 ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
     """The points after embedded iterations, if there are any, and the terms of the cost there."""
     layout, loss, refinement = against.layout, against.options.loss, against.options.refinement
     if not refinement.points:
         return points, observation_costs(layout, cameras, points, loss)
-    arguments = layout, cameras, slot_frames(layout, cameras), points, loss, refinement.points, against.previous
+    arguments = (
+        layout,
+        cameras,
+        slot_frames(layout, cameras),
+        points,
+        loss,
+        refinement.points,
+        against.previous,
+    )
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * predicted)
     if refinement.starts == "step":
         return refine_points(*arguments, min_decrease)

@@ -1,7 +1,8 @@
-"""Triangulation of points from the rays of their pixels, as an alternative start of embedded point iterations.
+"""Triangulation of points from the rays of their pixels, as an alternative start of embedded point
+iterations.
 
-The midpoint is the point nearest to all rays of its pixels, in least squares. With camera centres c and unit rays u it
-solves `sum (I - u u^T) X = sum (I - u u^T) c`."""
+The midpoint is the point nearest to all rays of its pixels, in least squares. With camera centres c
+and unit rays u it solves `sum (I - u u^T) X = sum (I - u u^T) c`."""
 
 from __future__ import annotations
 
@@ -23,13 +24,18 @@ from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
-UNDISTORTIONS = 10  # iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge.
-FEW_UNDISTORTIONS = 3  # the same within an iteration of the solver, where it is done for every candidate
+# iterations that undistort a pixel: fixed-point for BAL, else Newton's. They need not converge.
+UNDISTORTIONS = 10
+# the same within an iteration of the solver, where it is done for every candidate
+FEW_UNDISTORTIONS = 3
 
 
-def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDISTORTIONS) -> Float[Array, "3 points"]:
-    """The midpoint of the rays of every point. With parallel rays it is anywhere along them, or non-finite. `frames`
-    has the camera of every slot (`linearize.slot_frames`); so many iterations remove the distortion."""
+def midpoints(
+    layout: Layout, frames: camera.Frames, undistortions: int = UNDISTORTIONS
+) -> Float[Array, "3 points"]:
+    """The midpoint of the rays of every point. With parallel rays it is anywhere along them, or
+    non-finite. `frames` has the camera of every slot (`linearize.slot_frames`); so many iterations
+    remove the distortion."""
     zeros = jnp.zeros((3, layout.num_points), frames.lens[0].dtype)
     sums = point_passes(layout, frames)(zeros, functools.partial(_ray_terms, undistortions))
 
@@ -41,16 +47,28 @@ def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDIST
 
 
 def _ray_terms(undistortions: int, views: Views) -> list[Array]:
-    """Of every observation the six lower entries of `I - u u^T`, row by row, and the three of `(I - u u^T) c`."""
+    """Of every observation the six lower entries of `I - u u^T`, row by row, and the three of `(I -
+    u u^T) c`."""
     frame = views.frames
-    undistorted = frame.model.undistorted(list(frame.lens), frame.which, list(views.pixels), undistortions)
-    inverse_norm = 1 / jnp.sqrt(undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1] + 1)
+    undistorted = frame.model.undistorted(
+        list(frame.lens), frame.which, list(views.pixels), undistortions
+    )
+    inverse_norm = 1 / jnp.sqrt(
+        undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1] + 1
+    )
     camera_ray = [undistorted[0] * inverse_norm, undistorted[1] * inverse_norm, -inverse_norm]
-    to_world = lambda vector: [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
+    to_world = lambda vector: [
+        sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)
+    ]
     offset = list(frame.translation)
     for place in frame.places:  # first from the camera to its frame
-        back = lambda vector, place=place: [sum(place[3 * j + i] * vector[j] for j in range(3)) for i in range(3)]
-        camera_ray, offset = back(camera_ray), [t + b for t, b in zip(offset, back(place[9:]), strict=True)]
+        back = lambda vector, place=place: [
+            sum(place[3 * j + i] * vector[j] for j in range(3)) for i in range(3)
+        ]
+        camera_ray, offset = (
+            back(camera_ray),
+            [t + b for t, b in zip(offset, back(place[9:]), strict=True)],
+        )
     ray, center = to_world(camera_ray), [-x for x in to_world(offset)]
     along = sum(ray[i] * center[i] for i in range(3))
     matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
@@ -68,10 +86,12 @@ def choose_starts(
 ) -> Float[Array, "2 3 points"]:
     """Two starts for every point: its position after the step and the midpoint of its rays.
 
-    First the one of lower cost, or that has not diverged; then the other one, or the same if there is none.
+    First the one of lower cost, or that has not diverged; then the other one, or the same if there
+    is none.
 
-    If the linear model sends a point behind its cameras, or so far away that its gradient vanishes, its own steps do
-    not bring it back; the midpoint of its rays does, unless it diverged itself (`PreviousPoints`)."""
+    If the linear model sends a point behind its cameras, or so far away that its gradient vanishes,
+    its own steps do not bring it back; the midpoint of its rays does, unless it diverged itself
+    (`PreviousPoints`)."""
     middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
 
     def terms(views: Views, front: Array, *other: Array) -> list[Array]:
@@ -79,19 +99,32 @@ def choose_starts(
         for start in (views, views._replace(points=jnp.stack(other))):
             projection = start.projected()
             lost = (front & (projection.inverse_depth > 0)).astype(points.dtype)
-            found += [slot_costs(loss, view_residuals(start, projection)), lost, projection.inverse_depth]
+            found += [
+                slot_costs(loss, view_residuals(start, projection)),
+                lost,
+                projection.inverse_depth,
+            ]
         return found
 
     middle_at_slot = take_each(list(middle), layout.slot_point)
-    own, own_lost, own_inverse_depth, costs, lost, other_inverse_depth = point_passes(layout, frames)(
-        points, terms, previous.front, *middle_at_slot
+    own, own_lost, own_inverse_depth, costs, lost, other_inverse_depth = point_passes(
+        layout, frames
+    )(points, terms, previous.front, *middle_at_slot)
+    own, costs = (
+        add_point_terms(layout, cameras, at, [sums])[0]
+        for at, sums in ((points, own), (middle, costs))
     )
-    own, costs = (add_point_terms(layout, cameras, at, [sums])[0] for at, sums in ((points, own), (middle, costs)))
     diverged = (own_lost > 0) | has_receded(own_inverse_depth, previous.inverse_depth_sum)
-    possible = (lost == 0) & ~has_receded(other_inverse_depth, previous.inverse_depth_sum) & jnp.isfinite(costs)
+    possible = (
+        (lost == 0)
+        & ~has_receded(other_inverse_depth, previous.inverse_depth_sum)
+        & jnp.isfinite(costs)
+    )
     possible = points_alone(layout).where(possible, False)
     better = possible & ((costs < own) | diverged)
-    return jnp.stack([jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points)])
+    return jnp.stack(
+        [jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points)]
+    )
 
 
 def refine_from_starts(
@@ -105,9 +138,10 @@ def refine_from_starts(
     starts: int | Int[Array, ""],
     min_decrease: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """`refine_points` from one or two starts, of which the result with the lower cost is returned. The cost of a point
-    has several minima along its rays. Which is the lowest shows only after a few iterations. Arguments as there, after
-    the step; `starts`: 0: from `points`; 1: from the likelier of these and the midpoints; 2: from both."""
+    """`refine_points` from one or two starts, of which the result with the lower cost is returned.
+    The cost of a point has several minima along its rays. Which is the lowest shows only after a
+    few iterations. Arguments as there, after the step; `starts`: 0: from `points`; 1: from the
+    likelier of these and the midpoints; 2: from both."""
     choose = lambda *given: choose_starts(layout, given[0], given[1], given[2], loss, given[3])
     given = cameras, frames, points, previous
     candidates = loops.run_if(starts > 0, choose, given, jnp.stack([points, points]))

@@ -21,7 +21,8 @@ from jaxba.problem.safe_math import safe_sqrt
 @with_data(position=VECTOR, whitening=whitenings(3))
 @residual
 def control_point(point, *, position, whitening):
-    """A surveyed point: its difference from `position` (3), whitened by a matrix (3, 3) (three numbers)."""
+    """A surveyed point: its difference from `position` (3), whitened by a matrix (3, 3) (three
+    numbers)."""
     return times(whitening, point - position)
 
 
@@ -35,8 +36,9 @@ def distance(point, point_2, *, length, sigma):
 @with_data(normal=UNIT_VECTOR, on_plane=VECTOR, sigma=POSITIVE)
 @residual
 def point_to_plane(point, *, normal, on_plane, sigma):
-    """A surface that a LiDAR has measured: the distance of a point from the plane through `on_plane` (3) with a unit
-    `normal` (3), over `sigma` (one number). Source: Chen and Medioni 1992, "Object modelling by registration"."""
+    """A surface that a LiDAR has measured: the distance of a point from the plane through
+    `on_plane` (3) with a unit `normal` (3), over `sigma` (one number). Source: Chen and Medioni
+    1992, "Object modelling by registration"."""
     return normal @ (point - on_plane) / sigma
 
 
@@ -50,18 +52,22 @@ def baseline(pose, pose_2, *, length, sigma):
 @with_data(direction=DIRECTION, up=DIRECTION, sigma=deviations(3))
 @residual
 def gravity(pose, *, direction, up, sigma):
-    """What an accelerometer at rest measures, which is up: `direction` (3, in the camera's frame) against `up` (3, in
-    the world), of any length. The difference of the unit vectors, nearly the angle, over `sigma` (radians; three
-    numbers, of which two count). Source: GTSAM's attitude factors, which have two numbers in the tangent plane."""
-    return (times(pose.rotation, up) / jnp.sqrt(up @ up) - direction / jnp.sqrt(direction @ direction)) / sigma
+    """What an accelerometer at rest measures, which is up: `direction` (3, in the camera's frame)
+    against `up` (3, in the world), of any length. The difference of the unit vectors, nearly the
+    angle, over `sigma` (radians; three numbers, of which two count). Source: GTSAM's attitude
+    factors, which have two numbers in the tangent plane."""
+    return (
+        times(pose.rotation, up) / jnp.sqrt(up @ up) - direction / jnp.sqrt(direction @ direction)
+    ) / sigma
 
 
 @with_data(azimuth=NUMBER, north=DIRECTION, up=DIRECTION, sigma=POSITIVE)
 @residual
 def heading(pose, *, azimuth, north, up, sigma):
-    """What a compass measures: the azimuth of the optical axis, clockwise from `north` (3) about `up` (3) seen from
-    above, less `azimuth`, over `sigma` (radians; one number within pi / sigma). Of `north` the part across `up` counts.
-    Not defined where a camera looks straight up or down. Magnetic azimuths need the declination added."""
+    """What a compass measures: the azimuth of the optical axis, clockwise from `north` (3) about
+    `up` (3) seen from above, less `azimuth`, over `sigma` (radians; one number within pi / sigma).
+    Of `north` the part across `up` counts. Not defined where a camera looks straight up or down.
+    Magnetic azimuths need the declination added."""
     east = jnp.cross(north, up)
     ahead = jnp.cross(up, east) / jnp.sqrt(up @ up)
     x, y = pose.rotation[2] @ ahead, pose.rotation[2] @ east
@@ -72,5 +78,6 @@ def heading(pose, *, azimuth, north, up, sigma):
 @with_data(position=VECTOR, lever_arm=VECTOR, whitening=whitenings(3))
 @residual
 def position(pose, *, position, lever_arm, whitening):
-    """A GNSS antenna at `lever_arm` (3) in the camera's frame, at `position` (3) in the world, whitened (3, 3)."""
+    """A GNSS antenna at `lever_arm` (3) in the camera's frame, at `position` (3) in the world,
+    whitened (3, 3)."""
     return times(whitening, pose.center + times(pose.rotation.T, lever_arm) - position)

@@ -1,1 +1,2 @@
-"""What follows a solve: covariance, derivatives, retriangulation and its alternation with solves."""
+"""What follows a solve: covariance, derivatives, retriangulation and its alternation with
+solves."""

@@ -1,6 +1,8 @@
-"""Bundle adjustment and retriangulation in alternation, until retriangulation no longer lowers the cost.
+"""Bundle adjustment and retriangulation in alternation, until retriangulation no longer lowers the
+cost.
 
-Source: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited", section 4.4)."""
+Source: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
+section 4.4)."""
 
 from __future__ import annotations
 
@@ -39,18 +41,19 @@ def solve_and_retriangulate(
 ) -> Solution:
     """`solve` and, if it converged, `retriangulate`, alternately.
 
-    It ends when a retriangulation lowers the cost by at most `ftol` times the cost, or after `MAX_ROUNDS` of them.
-    Every solve starts with the policy's initial lambda. Returns one solution for all solves. Retriangulation is not an
-    iteration; its time is in `total_s` and `compile_s`. Raises ValueError, ProblemError: as `solve`.
+    It ends when a retriangulation lowers the cost by at most `ftol` times the cost, or after
+    `MAX_ROUNDS` of them. Every solve starts with the policy's initial lambda. Returns one solution
+    for all solves. Retriangulation is not an iteration; its time is in `total_s` and `compile_s`.
+    Raises ValueError, ProblemError: as `solve`.
 
     Args:
         problem: start of the optimisation.
         policy: as for `solve`.
-        options: as for `solve`; `max_iterations` and `Tolerances.seconds` limit all solves together. Retriangulation
-            uses the same loss, in float64 and without padding.
+        options: as for `solve`; `max_iterations` and `Tolerances.seconds` limit all solves
+            together. Retriangulation uses the same loss, in float64 and without padding.
         callback: as for `solve`; iterations and seconds are counted over all solves.
-        on_search: called after every retriangulation, including the last one, whose result is discarded if the decrease
-            is too small (`Retriangulation.pays`).
+        on_search: called after every retriangulation, including the last one, whose result is
+            discarded if the decrease is too small (`Retriangulation.pays`).
         watch: as for `solve`; iterations and seconds are counted over all solves.
         verbose: as for `solve`."""
     check_problem(problem)
@@ -67,7 +70,11 @@ def solve_and_retriangulate(
     run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
         solution = solves.total
-        if solves.stopped or not solution.converged or solution.iterations == options.max_iterations:
+        if (
+            solves.stopped
+            or not solution.converged
+            or solution.iterations == options.max_iterations
+        ):
             break
         started = time.perf_counter()
         with CompileClock() as clock:

@@ -1,6 +1,7 @@
 """pycolmap's functions for bundle adjustment, by `jaxba.solve`: a script changes one import.
 
-Source: COLMAP 4.2, `BundleAdjustmentController`, `DefaultBundleAdjuster`, `PosePriorBundleAdjuster`."""
+Source: COLMAP 4.2, `BundleAdjustmentController`, `DefaultBundleAdjuster`,
+`PosePriorBundleAdjuster`."""
 
 from __future__ import annotations
 
@@ -49,38 +50,47 @@ def bundle_adjustment(
 ) -> BundleAdjustmentSummary:
     """Optimises a `pycolmap.Reconstruction` in place, as `pycolmap.bundle_adjustment` does.
 
-    Without a config, views of points behind their image are first deleted from the reconstruction, and points that then
-    have fewer than two, as COLMAP does (`FilterObservationsWithNegativeDepth`); a `ProblemWarning` says how many. With
-    one they stay, and count for nothing.
+    Without a config, views of points behind their image are first deleted from the reconstruction,
+    and points that then have fewer than two, as COLMAP does
+    (`FilterObservationsWithNegativeDepth`); a `ProblemWarning` says how many. With one they stay,
+    and count for nothing.
 
-    Compiled programs are kept on disk, unless `jaxba.keep_programs` or the environment variable JAXBA_CACHE says
-    otherwise.
+    Compiled programs are kept on disk, unless `jaxba.keep_programs` or the environment variable
+    JAXBA_CACHE says otherwise.
 
     Args:
         reconstruction: start and result.
-        options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values: what is refined, the loss, the
-            tolerances, and the limits of iterations and of seconds. Those that COLMAP has by default mean jaxba's own.
-            What only says how Ceres computes means nothing; a `ProblemWarning` names what else is ignored.
-        config: a `pycolmap.BundleAdjustmentConfig`. None: all images, in the gauge of two cameras. A cancellation token
-            in its place, where pycolmap has it, is one.
-        cancellation_token: a `pycolmap.CancellationToken`; the solve stops after the iteration in which it is
-            cancelled.
+        options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values: what is
+            refined, the loss, the tolerances, and the limits of iterations and of seconds. Those
+            that COLMAP has by default mean jaxba's own. What only says how Ceres computes means
+            nothing; a `ProblemWarning` names what else is ignored.
+        config: a `pycolmap.BundleAdjustmentConfig`. None: all images, in the gauge of two cameras.
+            A cancellation token in its place, where pycolmap has it, is one.
+        cancellation_token: a `pycolmap.CancellationToken`; the solve stops after the iteration in
+            which it is cancelled.
 
     Returns:
-        The solution. If nothing is observed, one that is not usable, and the reconstruction is as it was.
+        The solution. If nothing is observed, one that is not usable, and the reconstruction is as
+        it was.
 
-    Raises: as `from_pycolmap` and `solve`; the reconstruction is as it was, but for deleted views."""
+    Raises: as `from_pycolmap` and `solve`; the reconstruction is as it was, but for deleted
+    views."""
     if hasattr(config, "is_cancelled"):
         config, cancellation_token = None, config
     token = cancellation_token or NEVER
     if config:
         return BundleAdjuster(options, config, reconstruction, token).solve()
     check_reconstruction(reconstruction)
-    return BundleAdjuster(options, everything(reconstruction), reconstruction, token, deletes=True).solve()
+    return BundleAdjuster(
+        options, everything(reconstruction), reconstruction, token, deletes=True
+    ).solve()
 
 
-def create_default_bundle_adjuster(options: Any, config: Any, reconstruction: Any) -> BundleAdjuster:
-    """What `pycolmap.create_default_bundle_adjuster` is for: its `solve()` is `bundle_adjustment` of the three.
+def create_default_bundle_adjuster(
+    options: Any, config: Any, reconstruction: Any
+) -> BundleAdjuster:
+    """What `pycolmap.create_default_bundle_adjuster` is for: its `solve()` is `bundle_adjustment`
+    of the three.
 
     Args:
         options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values.
@@ -96,12 +106,15 @@ def create_pose_prior_bundle_adjuster(
 
     Args:
         options: a `pycolmap.BundleAdjustmentOptions`, or a dictionary of its values.
-        prior_options: a `pycolmap.PosePriorBundleAdjustmentOptions`: the loss of priors, and the standard deviation of
-            those without a covariance. How COLMAP aligns means nothing here.
+        prior_options: a `pycolmap.PosePriorBundleAdjustmentOptions`: the loss of priors, and the
+            standard deviation of those without a covariance. How COLMAP aligns means nothing here.
         config: a `pycolmap.BundleAdjustmentConfig`; priors of other images count for nothing.
-        pose_priors: `pycolmap.PosePrior`s, in a list, or by ids of images in a dictionary as in COLMAP 3; Cartesian.
+        pose_priors: `pycolmap.PosePrior`s, in a list, or by ids of images in a dictionary as in
+            COLMAP 3; Cartesian.
         reconstruction: a `pycolmap.Reconstruction`, start and result."""
-    return BundleAdjuster(options, config, reconstruction, NEVER, priors=((prior_options, pose_priors),))
+    return BundleAdjuster(
+        options, config, reconstruction, NEVER, priors=((prior_options, pose_priors),)
+    )
 
 
 @dataclass(frozen=True)
@@ -118,7 +131,8 @@ class BundleAdjuster:
     priors: tuple[tuple[Any, Any], ...] = ()
     """Options of pose priors, and these, if there are any."""
 
-    @single_blas_thread()  # with two threads the gauge of a local adjustment took 30 ms beside a busy process
+    # with two threads the gauge of a local adjustment took 30 ms beside a busy process
+    @single_blas_thread()
     def solve(self) -> BundleAdjustmentSummary:
         """Optimises the reconstruction in place. Raises: as `bundle_adjustment`."""
         check_reconstruction(self.reconstruction)
@@ -144,8 +158,8 @@ class BundleAdjuster:
         return BundleAdjustmentSummary.of(solution)
 
     def _problem(self, options: Any) -> tuple[BundleProblem, list[Similarity], bool]:
-        """The problem to solve, how the whole reconstruction is first moved to the priors, and whether points lie
-        behind images that see them."""
+        """The problem to solve, how the whole reconstruction is first moved to the priors, and
+        whether points lie behind images that see them."""
         part = chosen_part(self.reconstruction, self.config, options)
         measured = [measured_positions(part, self.config, *pair) for pair in self.priors]
         moves = [alignment_to(part, positions) for positions in measured]
@@ -161,7 +175,8 @@ class BundleAdjuster:
 def _solve_after_search(
     problem: BundleProblem, options: SolveOptions, limit: TimeLimit, callback: Callback | None
 ) -> Solution:
-    """A solve from points that were searched with the cameras held, since no step leads back those that are far off."""
+    """A solve from points that were searched with the cameras held, since no step leads back those
+    that are far off."""
     searched = retriangulate(problem, options.loss)
     solution = solve(searched.problem, options=limit.rest(options), callback=callback)
     return replace(solution, initial_cost=searched.cost_before)
@@ -187,7 +202,9 @@ def _transform(reconstruction: Any, by: Similarity) -> None:
 def _stop_of(token: Any) -> Callback | None:
     """What stops a solve between iterations: a token. Raises ValueError: no token."""
     if not hasattr(token, "is_cancelled"):
-        raise ValueError(f"cancellation_token must be a pycolmap.CancellationToken, not {shown(token)}")
+        raise ValueError(
+            f"cancellation_token must be a pycolmap.CancellationToken, not {shown(token)}"
+        )
 
     def is_cancelled(record: Any) -> bool:
         return token.is_cancelled
@@ -196,15 +213,22 @@ def _stop_of(token: Any) -> Callback | None:
 
 
 def solve_options(options: Any) -> SolveOptions:
-    """What a `pycolmap.BundleAdjustmentOptions` says of the solve, where it says something else than COLMAP's default.
-    A ProblemWarning names what changes where COLMAP ends, and means nothing here."""
+    """What a `pycolmap.BundleAdjustmentOptions` says of the solve, where it says something else
+    than COLMAP's default. A ProblemWarning names what changes where COLMAP ends, and means nothing
+    here."""
     unused = ignored(options)
     if unused:
         text = f"options: ignored {', '.join(unused)}, so that COLMAP may end elsewhere"
         warnings.warn(text, ProblemWarning, stacklevel=5)
     group = ceres_options(options)
     solver = group.solver_options
-    tolerances = {own: getattr(solver, name) for name, own in TOLERANCES.items() if changed(options, name)}
-    limit = {"max_iterations": solver.max_num_iterations} if changed(options, "max_num_iterations") else {}
+    tolerances = {
+        own: getattr(solver, name) for name, own in TOLERANCES.items() if changed(options, name)
+    }
+    limit = (
+        {"max_iterations": solver.max_num_iterations}
+        if changed(options, "max_num_iterations")
+        else {}
+    )
     loss = loss_of(group.loss_function_type.name, group.loss_function_scale)
     return SolveOptions(loss=loss, tolerances=Tolerances(**tolerances), **limit)

@@ -23,8 +23,8 @@ class BundleAdjustmentSummary(Solution):
 
     @property
     def termination_type(self) -> Any:
-        """`CONVERGENCE`, `NO_CONVERGENCE` or `FAILURE`, as a `pycolmap.BundleAdjustmentTerminationType`; of COLMAP 3 a
-        `TerminationType` of Ceres."""
+        """`CONVERGENCE`, `NO_CONVERGENCE` or `FAILURE`, as a
+        `pycolmap.BundleAdjustmentTerminationType`; of COLMAP 3 a `TerminationType` of Ceres."""
         name = "CONVERGENCE" if self.converged else "NO_CONVERGENCE"
         if self.termination in FAILED:
             name = "FAILURE"

@@ -23,7 +23,8 @@ STOPS = (Termination.STOPPED, Termination.TIME_LIMIT)
 
 
 class Consecutive:
-    """Solves with one policy and one time limit. Callback and watch count iterations and seconds over all of them."""
+    """Solves with one policy and one time limit. Callback and watch count iterations and seconds
+    over all of them."""
 
     stopped = False
     """Whether the callback has asked to stop, or the time limit is over."""
@@ -46,21 +47,32 @@ class Consecutive:
         return functools.reduce(joined, self.done)
 
     def solve(
-        self, away: Int[np.ndarray, " away"], problem: BundleProblem, options: SolveOptions, whole: BundleProblem
+        self,
+        away: Int[np.ndarray, " away"],
+        problem: BundleProblem,
+        options: SolveOptions,
+        whole: BundleProblem,
     ) -> Solution:
-        """`solve_without`; who watches sees the parameters in `whole`. It runs from Python, so that all limits use the
-        same programs."""
-        count, seconds = sum(one.iterations for one in self.done), sum(one.total_s for one in self.done)
+        """`solve_without`; who watches sees the parameters in `whole`. It runs from Python, so that
+        all limits use the same programs."""
+        count, seconds = (
+            sum(one.iterations for one in self.done),
+            sum(one.total_s for one in self.done),
+        )
         watch = self._watch
 
         def of_all(record: IterationRecord) -> IterationRecord:
-            return record._replace(iteration=record.iteration + count, time_s=record.time_s + seconds)
+            return record._replace(
+                iteration=record.iteration + count, time_s=record.time_s + seconds
+            )
 
         def forward(record: IterationRecord) -> bool:
             self.stopped = bool(self._callback and self._callback(of_all(record)))
             return self.stopped
 
-        seen = watch and (lambda record, now: watch(of_all(record), lambda: with_parameters(whole, now())))
+        seen = watch and (
+            lambda record, now: watch(of_all(record), lambda: with_parameters(whole, now()))
+        )
         hooks = {"callback": forward, "watch": seen, "waiting": self._waiting}
         found = solve_without(away, problem, self._policy, self._limit.rest(options), **hooks)
         self.stopped |= found.termination == Termination.TIME_LIMIT
@@ -75,7 +87,8 @@ def with_parameters(problem: BundleProblem, found: BundleProblem) -> BundleProbl
 
 
 def joined(before: Solution, last: Solution) -> Solution:
-    """The solution of two consecutive solves together. One that follows a stopped one only computes costs."""
+    """The solution of two consecutive solves together. One that follows a stopped one only computes
+    costs."""
     return replace(
         last,
         termination=before.termination if before.termination in STOPS else last.termination,
@@ -83,7 +96,9 @@ def joined(before: Solution, last: Solution) -> Solution:
         start=before.start,
         iterations=before.iterations + last.iterations,
         accepted=before.accepted + last.accepted,
-        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
+        history=jax.tree.map(
+            lambda *columns: np.concatenate(columns), before.history, last.history
+        ),
         setup_s=before.setup_s + last.setup_s,
         compile_s=before.compile_s + last.compile_s,
         total_s=before.total_s + last.total_s,

@@ -1,16 +1,21 @@
-"""Covariance of what a solve finds: of poses, lenses and points, by the inverse of the Gauss-Newton Hessian.
+"""Covariance of what a solve finds: of poses, lenses and points, by the inverse of the Gauss-Newton
+Hessian.
 
-With `J^T J = [[B, E], [E^T, C]]` of the unknown numbers of cameras and points at the minimum, undamped,
+With `J^T J = [[B, E], [E^T, C]]` of the unknown numbers of cameras and points at the minimum,
+undamped,
 
     cov(cameras) = S^-1,    S = B - E C^-1 E^T,
     cov(points)  = C^-1 + C^-1 E^T S^-1 E C^-1,    of given cameras: C^-1.
 
-Directions that nothing determines are left out of both inverses. A number has a covariance if none of them moves it.
+Directions that nothing determines are left out of both inverses. A number has a covariance if none
+of them moves it.
 
-It is that of the parameters if residuals are independent with unit variance: whitened, or pixels with a noise of one
-pixel (else multiply by the variance). Robust losses weigh it as they weigh the cost.
+It is that of the parameters if residuals are independent with unit variance: whitened, or pixels
+with a noise of one pixel (else multiply by the variance). Robust losses weigh it as they weigh the
+cost.
 
-Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 9; COLMAP, `EstimateBACovariance`."""
+Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 9; COLMAP,
+`EstimateBACovariance`."""
 
 from __future__ import annotations
 
@@ -33,7 +38,15 @@ from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.information import CHUNK, COMPONENT, System, inverse_of, linear_at, system_of, unknown_index
+from jaxba.solver.information import (
+    CHUNK,
+    COMPONENT,
+    System,
+    inverse_of,
+    linear_at,
+    system_of,
+    unknown_index,
+)
 from jaxba.solver.place import check_problem, placed
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.structure.unknowns import Unknowns
@@ -42,10 +55,12 @@ from jaxba.typing import ArrayRecord
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Covariance(ArrayRecord):
-    """Covariances. Rows and columns of what is constant are zero; those of what is not determined are NaN."""
+    """Covariances. Rows and columns of what is constant are zero; those of what is not determined
+    are NaN."""
 
     poses: Float[np.ndarray, "cameras 6 6"]
-    """Of the pose of each camera: rotation (left perturbation `exp(d) R`, radians), then translation (scene units)."""
+    """Of the pose of each camera: rotation (left perturbation `exp(d) R`, radians), then
+    translation (scene units)."""
 
     lenses: Float[np.ndarray, "lenses numbers numbers"]
     """Of the numbers of each lens."""
@@ -63,8 +78,8 @@ class Covariance(ArrayRecord):
     """Of all unknown numbers of cameras together."""
 
     changes: Float[np.ndarray, "cameras 6 width"]
-    """From the unknowns of a camera to its pose: of frame and extrinsics through the rig, of a shifted scene to this
-    one."""
+    """From the unknowns of a camera to its pose: of frame and extrinsics through the rig, of a
+    shifted scene to this one."""
 
     rotations: Float[np.ndarray, "cameras 3 3"]
     """Rotation matrices of the cameras."""
@@ -81,7 +96,8 @@ class Covariance(ArrayRecord):
         return _through(change, _submatrix(self.cameras, rows))
 
     def relative_pose(self, first: int, second: int) -> Float[np.ndarray, "6 6"]:
-        """Covariance of a camera's pose in the frame of another, `P_2 = R P_1 + t`: left perturbation of R, and t.
+        """Covariance of a camera's pose in the frame of another, `P_2 = R P_1 + t`: left
+        perturbation of R, and t.
 
         By first-order propagation through `R = R_2 R_1^T` and `t = t_2 - R t_1`."""
         relative = self.rotations[second] @ self.rotations[first].T
@@ -99,17 +115,24 @@ class Covariance(ArrayRecord):
 def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covariance:
     """The covariance of the numbers of a problem at its minimum.
 
-    Memory grows with the square of the unknown numbers of cameras, and time with their cube. What is not determined by
-    what is observed, as a point that is seen once, has NaN, and a ProblemWarning names it. The problem is a solved one,
-    with the constants, gauge, priors and other residuals that were used; `loss` is the robust loss of the solve,
-    squared if None. Raises ProblemError: the position, orientation or scale of the scene is free; `with_gauge`,
-    constants or priors fix them."""
+    Memory grows with the square of the unknown numbers of cameras, and time with their cube. What
+    is not determined by what is observed, as a point that is seen once, has NaN, and a
+    ProblemWarning names it. The problem is a solved one, with the constants, gauge, priors and
+    other residuals that were used; `loss` is the robust loss of the solve, squared if None. Raises
+    ProblemError: the position, orientation or scale of the scene is free; `with_gauge`, constants
+    or priors fix them."""
     check_problem(problem)
-    options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
+    options = StepOptions(
+        linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold")
+    )
     given, (counted, offset, problem) = problem, placed(problem, facing_away(problem))
     free = SIMILARITY - fixed_freedoms(counted)
     if free:
-        which = "7 directions of the cameras are" if free == SIMILARITY else f"{free} of 7 directions of the scene are"
+        which = (
+            "7 directions of the cameras are"
+            if free == SIMILARITY
+            else f"{free} of 7 directions of the scene are"
+        )
         hint = "fix them with a gauge, constants or priors"
         raise ProblemError(f"{which} not determined by what is observed; {hint}")
     with numerics(np.float64):
@@ -128,7 +151,10 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     given_cameras = system.turn @ system.inverse @ system.turn.transpose(0, 2, 1)
     own = slice(given.num_points)  # without those that stand for rows of residuals
     lost_by_points = system.lost | (~system.seen & free_points)[:, None]
-    for matrices, lost in ((marginal, lost_by_points | lost_by_cameras), (given_cameras, lost_by_points)):
+    for matrices, lost in (
+        (marginal, lost_by_points | lost_by_cameras),
+        (given_cameras, lost_by_points),
+    ):
         matrices[lost[:, :, None] | lost[:, None]] = np.nan
     lost = np.linalg.norm(null, axis=1) > COMPONENT
     of_cameras = np.where(lost[:, None] | lost, np.nan, inverse)
@@ -147,19 +173,31 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
         "lens": np.setdiff1d(np.flatnonzero(has(lenses)), unseen),
         "point": np.flatnonzero((has(marginal) & system.seen)[own]),
     }
-    parts = [part_names(problem.labels, kind, which) for kind, which in undetermined.items() if len(which)]
+    parts = [
+        part_names(problem.labels, kind, which)
+        for kind, which in undetermined.items()
+        if len(which)
+    ]
     if parts:
-        note = f"not determined by what is observed, so with NaN for a covariance: {', '.join(parts)}"
+        note = (
+            f"not determined by what is observed, so with NaN for a covariance: {', '.join(parts)}"
+        )
         warnings.warn(note, ProblemWarning, stacklevel=2)
     of_points = marginal[own], given_cameras[own]
-    return Covariance(poses, lenses, *of_points, index, of_cameras, changes, rotations, cameras[:, 3:6])
+    return Covariance(
+        poses, lenses, *of_points, index, of_cameras, changes, rotations, cameras[:, 3:6]
+    )
 
 
 def _changes(
-    problem: BundleProblem, layout: Layout, rotations: Float[np.ndarray, "cameras 3 3"], offset: np.ndarray
+    problem: BundleProblem,
+    layout: Layout,
+    rotations: Float[np.ndarray, "cameras 3 3"],
+    offset: np.ndarray,
 ) -> Float[np.ndarray, "cameras 6 width"]:
-    """`Covariance.changes`. With a step w, d of its frame and v, e of its extrinsics, a camera in a rig turns by
-    `M w + v` and moves by `M d + v x M t_r + e`; of a scene shifted by -o, `t = t' - R o`."""
+    """`Covariance.changes`. With a step w, d of its frame and v, e of its extrinsics, a camera in a
+    rig turns by `M w + v` and moves by `M d + v x M t_r + e`; of a scene shifted by -o, `t = t' - R
+    o`."""
     unknowns = layout.unknowns
     changes = np.tile(np.eye(POSE_SIZE, unknowns.width), (len(rotations), 1, 1))
     if unknowns.in_rigs:
@@ -181,7 +219,8 @@ def _changes(
 def _marginal(
     system: System, of_cameras: Float[np.ndarray, "n n"], null: Float[np.ndarray, "n directions"]
 ) -> tuple[Float[np.ndarray, "points 3 3"], Bool[np.ndarray, "points 3"]]:
-    """`C^-1 + C^-1 E^T S^-1 E C^-1` of each point, and the coordinates of points that cameras leave undetermined."""
+    """`C^-1 + C^-1 E^T S^-1 E C^-1` of each point, and the coordinates of points that cameras leave
+    undetermined."""
     count, unknowns = len(system.seen), len(of_cameras)
     cross = (system.by_point.T @ system.jacobian).tocsr()
     own = np.sqrt(np.asarray(system.jacobian.multiply(system.jacobian).sum(axis=0)).ravel())
@@ -194,14 +233,24 @@ def _marginal(
         columns = of_part.toarray().reshape(*given.shape[:2], unknowns)
         middle = np.einsum("piu,pju->pij", columns, product.reshape(columns.shape))
         found[part] += given @ middle @ given
-        follow = system.turn[part] @ given @ np.asarray(of_part @ null).reshape(*given.shape[:2], null.shape[1])
-        deviation = np.sqrt(np.einsum("pij,pjk,pik->pi", system.turn[part], given, system.turn[part]))
+        follow = (
+            system.turn[part]
+            @ given
+            @ np.asarray(of_part @ null).reshape(*given.shape[:2], null.shape[1])
+        )
+        deviation = np.sqrt(
+            np.einsum("pij,pjk,pik->pi", system.turn[part], given, system.turn[part])
+        )
         lost[part] = np.linalg.norm(follow, axis=2) > COMPONENT * deviation
     return system.turn @ found @ system.turn.transpose(0, 2, 1), lost
 
 
 def _of_lenses(
-    problem: BundleProblem, unknowns: Unknowns, seen: np.ndarray, index: np.ndarray, of_cameras: np.ndarray
+    problem: BundleProblem,
+    unknowns: Unknowns,
+    seen: np.ndarray,
+    index: np.ndarray,
+    of_cameras: np.ndarray,
 ) -> Float[np.ndarray, "lenses numbers numbers"]:
     lenses = every_lens(problem)
     size = lens_size(problem.lenses)
@@ -215,7 +264,9 @@ def _of_lenses(
     return found
 
 
-def _through(change: Float[np.ndarray, "m n"], matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
+def _through(
+    change: Float[np.ndarray, "m n"], matrix: Float[np.ndarray, "n n"]
+) -> Float[np.ndarray, "m m"]:
     """`change matrix change^T`, NaN where it depends on a number that is NaN."""
     lost = np.isnan(np.diagonal(matrix))
     found = change @ np.where(lost[:, None] | lost, 0.0, matrix) @ change.T

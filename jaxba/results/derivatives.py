@@ -1,17 +1,18 @@
 """Derivatives of what a solve finds, by the implicit function theorem.
 
-At a minimum the gradient g of the cost by the unknowns y vanishes, g(y, theta) = 0, where theta are observations,
-their whitening, measured positions and what is constant. So
+At a minimum the gradient g of the cost by the unknowns y vanishes, g(y, theta) = 0, where theta are
+observations, their whitening, measured positions and what is constant. So
 
     dy/dtheta = -H^-1 dg/dtheta,    H = dg/dy,
 
-with the exact Hessian H, not its Gauss-Newton approximation. Reverse mode takes one solve with H: conjugate gradients
-with products by forward over reverse mode, preconditioned by the Schur complement of the Gauss-Newton system, that is,
-by the linear solver of the solve itself. Nothing is differentiated through iterations. Where symmetries leave an orbit
-of minima (problem/freedoms.py), H is singular along it: y moves orthogonally to the orbit, by the pseudo-inverse.
+with the exact Hessian H, not its Gauss-Newton approximation. Reverse mode takes one solve with H:
+conjugate gradients with products by forward over reverse mode, preconditioned by the Schur
+complement of the Gauss-Newton system, that is, by the linear solver of the solve itself. Nothing is
+differentiated through iterations. Where symmetries leave an orbit of minima (problem/freedoms.py),
+H is singular along it: y moves orthogonally to the orbit, by the pseudo-inverse.
 
-Source: Griewank and Walther 2008, "Evaluating Derivatives", chapter 15; Blondel et al. 2022, "Efficient and Modular
-Implicit Differentiation"."""
+Source: Griewank and Walther 2008, "Evaluating Derivatives", chapter 15; Blondel et al. 2022,
+"Efficient and Modular Implicit Differentiation"."""
 
 from __future__ import annotations
 
@@ -37,7 +38,13 @@ from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, check_is_problem
 from jaxba.problem.facing import facing_away
-from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, fixed_freedoms, free_directions
+from jaxba.problem.freedoms import (
+    RESOLVED,
+    SIMILARITY,
+    determined_directions,
+    fixed_freedoms,
+    free_directions,
+)
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.problem.residuals import Residuals
@@ -55,16 +62,19 @@ from jaxba.structure.segment_sums import take
 from jaxba.typing import AnyArray, differ, outline, same
 
 DAMPING = 1e-10
-"""lambda of the Gauss-Newton system in the preconditioner: enough that a free gauge leaves it positive definite."""
+"""lambda of the Gauss-Newton system in the preconditioner: enough that a free gauge leaves it
+positive definite."""
 
 TOLERANCE = 1e-12
 """Relative residual at which conjugate gradients with the exact Hessian stop."""
 
 LARGEST_RESIDUAL = 1e-6
-"""Relative residual above which derivatives are refused. Where the solution is determined it is below 1e-12."""
+"""Relative residual above which derivatives are refused. Where the solution is determined it is
+below 1e-12."""
 
 MAX_PRODUCTS = 300
-"""Most products with the exact Hessian. Where residuals are small the Gauss-Newton system is nearly it, and ten do."""
+"""Most products with the exact Hessian. Where residuals are small the Gauss-Newton system is nearly
+it, and ten do."""
 
 
 class SolveInputs(NamedTuple):
@@ -80,10 +90,12 @@ class SolveInputs(NamedTuple):
     """Points at the start; the solution depends on the constant ones."""
 
     residuals: tuple[tuple[Float[AnyArray, "_ ..."], ...], ...] = ()
-    """For the rows of each residual of the problem besides pixels (`problem.residuals.rows`) their data."""
+    """For the rows of each residual of the problem besides pixels (`problem.residuals.rows`) their
+    data."""
 
     whitening: Float[AnyArray, "observations 2 2"] | None = None
-    """`Sigma^(-1/2)` of each observation (1 / pixels); None: that of the problem, without a derivative."""
+    """`Sigma^(-1/2)` of each observation (1 / pixels); None: that of the problem, without a
+    derivative."""
 
     __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
 
@@ -92,30 +104,38 @@ def inputs_of(problem: BundleProblem) -> SolveInputs:
     """The numbers of a problem that `differentiable_solve` takes. Raises ValueError: it is none."""
     check_is_problem(problem)
     data = tuple(rows.data for rows in problem.residuals.rows)
-    return SolveInputs(problem.observations, problem.cameras, problem.points, data, problem.whitening)
+    return SolveInputs(
+        problem.observations, problem.cameras, problem.points, data, problem.whitening
+    )
 
 
 def differentiable_solve(
-    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
+    problem: BundleProblem,
+    policy: str | DampingPolicy = DEFAULT_POLICY,
+    options: SolveOptions | None = None,
 ) -> Callable[[SolveInputs], tuple[Float[Array, "cameras parameters"], Float[Array, "points 3"]]]:
-    """A solve as a function with derivatives: from `SolveInputs` to the cameras and points at the minimum.
+    """A solve as a function with derivatives: from `SolveInputs` to the cameras and points at the
+    minimum.
 
-    Reverse mode works (`jax.grad`, `jax.vjp`, `jax.jacrev`). Inside `jax.jit` and `jax.vmap` the solve is the compiled
-    loop of `jaxba.solve_loop`, where which images face away is that of the problem; outside it is `solve`, which
-    compiles in less time. 64 bits must be enabled in JAX. The start is that of the inputs, and the minimum that it
-    leads to counts as a function of them.
+    Reverse mode works (`jax.grad`, `jax.vjp`, `jax.jacrev`). Inside `jax.jit` and `jax.vmap` the
+    solve is the compiled loop of `jaxba.solve_loop`, where which images face away is that of the
+    problem; outside it is `solve`, which compiles in less time. 64 bits must be enabled in JAX. The
+    start is that of the inputs, and the minimum that it leads to counts as a function of them.
 
-    A free gauge leaves an orbit of minima, and a point that is seen once a ray of them. The derivative is that of the
-    minimum that moves at right angles to these (in radians and scene units). What is the same on all of an orbit, as
-    lenses, angles, ratios of distances, and aligned cameras, has no other derivative; the rest of what a solve finds
-    also depends on its way there, which differences see and derivatives do not.
+    A free gauge leaves an orbit of minima, and a point that is seen once a ray of them. The
+    derivative is that of the minimum that moves at right angles to these (in radians and scene
+    units). What is the same on all of an orbit, as lenses, angles, ratios of distances, and aligned
+    cameras, has no other derivative; the rest of what a solve finds also depends on its way there,
+    which differences see and derivatives do not.
 
-    The problem says everything that the inputs do not: who sees what, lenses, constants, priors, rigs. `policy` and
-    `options` are as for `solve`. The scale of the loss is an input as well: a loss of scale one has the same minimum
-    where the whitening of all residuals is divided by the scale. Tolerances should be tight: the theorem holds at a
-    minimum. Derivatives of the returned function raise a ProblemError if conjugate gradients do not solve with the
-    Hessian, as where more than gauge and depths of points is not determined; inside `jax.jit` and `jax.vmap` they are
-    NaN then."""
+    The problem says everything that the inputs do not: who sees what, lenses, constants, priors,
+    rigs. `policy` and
+    `options` are as for `solve`. The scale of the loss is an input as well: a loss of scale one has
+    the same minimum
+    where the whitening of all residuals is divided by the scale. Tolerances should be tight: the
+    theorem holds at a minimum. Derivatives of the returned function raise a ProblemError if
+    conjugate gradients do not solve with the Hessian, as where more than gauge and depths of points
+    is not determined; inside `jax.jit` and `jax.vmap` they are NaN then."""
     check_problem(problem)
     options = checked_options(options)
 
@@ -123,7 +143,9 @@ def differentiable_solve(
     def prepared() -> _Prepared:
         with jax.ensure_compile_time_eval():  # a trace may be what asks for it
             fixed = bool(problem.residuals) and fixed_freedoms(problem) == SIMILARITY
-            return _Prepared.of(problem, policy, options, facing_away(problem))._replace(fixed=fixed)
+            return _Prepared.of(problem, policy, options, facing_away(problem))._replace(
+                fixed=fixed
+            )
 
     @jax.custom_vjp
     def find(inputs: SolveInputs) -> tuple[Array, Array]:
@@ -137,13 +159,18 @@ def differentiable_solve(
             solved = solve(_with_inputs(problem, inputs), policy, options).problem
             return (jnp.asarray(solved.cameras), jnp.asarray(solved.points)), (inputs, solved)
 
-    def backward(saved: tuple[SolveInputs, Any], cotangents: tuple[Array, Array]) -> tuple[SolveInputs]:
+    def backward(
+        saved: tuple[SolveInputs, Any], cotangents: tuple[Array, Array]
+    ) -> tuple[SolveInputs]:
         inputs, end = saved
         if not isinstance(end, BundleProblem):
             return (prepared().transposed(inputs, end[0], end[1], cotangents),)
         with numerics(np.float64):
             at = _Prepared.of(end, policy, options, facing_away(_with_inputs(end, inputs)))
-            here, symmetries = at.setup.placed.here, _symmetries(at.setup.placed.counted, at.setup.layout)
+            here, symmetries = (
+                at.setup.placed.here,
+                _symmetries(at.setup.placed.counted, at.setup.layout),
+            )
             return (at.transposed(inputs, here.cameras, here.points, cotangents, symmetries),)
 
     find.defvjp(forward, backward)
@@ -173,24 +200,40 @@ class _Prepared(NamedTuple):
 
     @classmethod
     def of(
-        cls, problem: BundleProblem, policy: str | DampingPolicy, options: SolveOptions, away: Int[np.ndarray, " away"]
+        cls,
+        problem: BundleProblem,
+        policy: str | DampingPolicy,
+        options: SolveOptions,
+        away: Int[np.ndarray, " away"],
     ) -> _Prepared:
         """`away`: cameras whose views do not count."""
-        setup = set_up(problem, policy, replace(options, pad=False, devices=1, dtype="float64"), away)
+        setup = set_up(
+            problem, policy, replace(options, pad=False, devices=1, dtype="float64"), away
+        )
         if setup.placed.offset.any():
-            raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
+            raise ProblemError(
+                "derivatives need a scene near the origin: shift it first (its extent is much "
+                "smaller)"
+            )
         kept = np.flatnonzero(~np.isin(problem.camera_index, away))  # observations that count
         here = setup.placed.here.camera_index
-        rest = np.zeros(len(here) - len(kept) + 1, int)  # those that stand for other residuals, and none
+        # those that stand for other residuals, and none
+        rest = np.zeros(len(here) - len(kept) + 1, int)
         return cls(setup, np.append(kept, rest)[setup.layout.observation], options)
 
-    def solved(self, inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, tuple[Array, Array]]]:
+    def solved(
+        self, inputs: SolveInputs
+    ) -> tuple[tuple[Array, Array], tuple[SolveInputs, tuple[Array, Array]]]:
         """The solution inside a transformation of JAX, and what `transposed` takes."""
         setup, (cameras, points) = self.setup, self.setup.start
         model = _Model.of(setup.layout, self.slots, cameras, inputs.points, inputs)
         layout, limit = model.with_data(inputs), self.options.max_iterations
-        start = state_of(layout, model.of_frames(inputs.cameras), inputs.points, setup.options, jnp.float64)
-        end = solve_loop(layout, start, setup.policy, self.options.tolerances, setup.options, limit)[0].state
+        start = state_of(
+            layout, model.of_frames(inputs.cameras), inputs.points, setup.options, jnp.float64
+        )
+        end = solve_loop(
+            layout, start, setup.policy, self.options.tolerances, setup.options, limit
+        )[0].state
         points = jnp.asarray(inputs.points).at[layout.points].set(end.points.T, mode="drop")
         return (model.as_given(end.cameras).T, points), (inputs, (end.cameras.T, points))
 
@@ -198,7 +241,9 @@ class _Prepared(NamedTuple):
         """`_symmetries` inside a transformation of JAX."""
         setup = self.setup
         if setup.problem.residuals and not self.fixed:
-            raise ProblemError("inside jax.jit and jax.vmap a problem with other residuals needs a fixed gauge")
+            raise ProblemError(
+                "inside jax.jit and jax.vmap a problem with other residuals needs a fixed gauge"
+            )
 
         def host(cameras: Array, points: Array) -> tuple[np.ndarray, np.ndarray]:
             order = np.minimum(np.asarray(setup.layout.points), len(points) - 1)
@@ -221,7 +266,8 @@ class _Prepared(NamedTuple):
         cotangents: tuple[Array, Array],
         symmetries: Any = None,
     ) -> SolveInputs:
-        """Cotangents of the inputs for those of the solution, which has these parameters where it is computed."""
+        """Cotangents of the inputs for those of the solution, which has these parameters where it
+        is computed."""
         step = replace(
             self.setup.options,
             coordinates=replace(self.setup.options.coordinates, rotation="manifold"),
@@ -230,20 +276,25 @@ class _Prepared(NamedTuple):
         layout, slots = self.setup.layout, jnp.asarray(self.slots)
         symmetries = self.symmetries(cameras, points) if symmetries is None else symmetries
         arguments = (layout, slots, cameras, points, *symmetries, inputs, cotangents)
-        found, residual = jit(_solve_transposed, once=True, static_argnames="options")(*arguments, options=step)
+        found, residual = jit(_solve_transposed, once=True, static_argnames="options")(
+            *arguments, options=step
+        )
         if is_traced(residual):
             return jax.tree.map(lambda x: jnp.where(residual < LARGEST_RESIDUAL, x, jnp.nan), found)
         if not float(residual) < LARGEST_RESIDUAL:
-            raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
+            raise ProblemError(
+                "the solution is not determined well enough for derivatives: the Hessian is "
+                "singular"
+            )
         return found
 
 
 def _symmetries(
     solved: BundleProblem, layout: Layout, *, fixed: bool = False
 ) -> tuple[Float[np.ndarray, "7 numbers"], Float[np.ndarray, "points 3 3"]]:
-    """What leaves the cost as it is: an orthonormal basis of seven directions of the gauge, zero for those that are not
-    free, in all numbers of cameras and points; and the directions in which rays determine points, in layout order.
-    `fixed`: it is known that none is free."""
+    """What leaves the cost as it is: an orthonormal basis of seven directions of the gauge, zero
+    for those that are not free, in all numbers of cameras and points; and the directions in which
+    rays determine points, in layout order. `fixed`: it is known that none is free."""
     order, determined = np.asarray(layout.points), determined_directions(solved)
     cameras, points = free_directions(solved.replace(residuals=Residuals()) if fixed else solved)
     more = layout.num_cameras - solved.num_cameras
@@ -262,7 +313,8 @@ def _symmetries(
 
 
 class _Model(NamedTuple):
-    """Parameters where a problem is computed, as functions of steps of the unknowns and of the inputs."""
+    """Parameters where a problem is computed, as functions of steps of the unknowns and of the
+    inputs."""
 
     layout: Layout
     slots: AnyArray
@@ -272,15 +324,31 @@ class _Model(NamedTuple):
     real: int  # points of the problem; others pad
 
     @classmethod
-    def of(cls, layout: Layout, slots: AnyArray, cameras: AnyArray, points: AnyArray, inputs: SolveInputs) -> _Model:
+    def of(
+        cls,
+        layout: Layout,
+        slots: AnyArray,
+        cameras: AnyArray,
+        points: AnyArray,
+        inputs: SolveInputs,
+    ) -> _Model:
         """Of parameters as `Placed.here` has them."""
         found = jnp.asarray(points).at[layout.points].get(mode="fill", fill_value=0).T
-        return cls(layout, jnp.asarray(slots), jnp.asarray(cameras).T, found, len(inputs.cameras), len(points))
+        return cls(
+            layout,
+            jnp.asarray(slots),
+            jnp.asarray(cameras).T,
+            found,
+            len(inputs.cameras),
+            len(points),
+        )
 
     @property
     def zero(self) -> tuple[Array, Array]:
         """No step."""
-        return jnp.zeros((self.cameras.shape[1], self.layout.unknowns.width)), jnp.zeros_like(self.points)
+        return jnp.zeros((self.cameras.shape[1], self.layout.unknowns.width)), jnp.zeros_like(
+            self.points
+        )
 
     @property
     def end(self) -> int:
@@ -289,12 +357,16 @@ class _Model(NamedTuple):
 
     def with_data(self, theta: SolveInputs) -> Layout:
         """The layout with what the inputs measured."""
-        in_slots = lambda x: jnp.where(self.layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., self.slots], 0)
+        in_slots = lambda x: jnp.where(
+            self.layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., self.slots], 0
+        )
         here = replace(self.layout, pixels=in_slots(theta.observations))
         if theta.whitening is not None:
             here = replace(here, whitening=in_slots(theta.whitening))
         own = zip(here.residuals, theta.residuals, strict=True)
-        return replace(here, residuals=tuple(replace(x, rows=replace(x.rows, data=data)) for x, data in own))
+        return replace(
+            here, residuals=tuple(replace(x, rows=replace(x.rows, data=data)) for x, data in own)
+        )
 
     def of_frames(self, cameras: AnyArray) -> Array:
         """Cameras as the inputs have them, as those of the state."""
@@ -305,13 +377,20 @@ class _Model(NamedTuple):
         place = state[end - EXTRINSICS_SIZE : end]
         turn, rows = rotation_matrix(place[:3]), jnp.asarray(cameras).T
         moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
-        return jnp.concatenate([compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place, state[end:]]).T
+        return jnp.concatenate(
+            [compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place, state[end:]]
+        ).T
 
-    def moved(self, y: tuple[Array, Array], theta: SolveInputs, determined: Array) -> tuple[Array, Array]:
-        """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
+    def moved(
+        self, y: tuple[Array, Array], theta: SolveInputs, determined: Array
+    ) -> tuple[Array, Array]:
+        """Parameters for a step of the unknowns from the solution; what is constant is that of the
+        inputs."""
         unknowns = self.layout.unknowns
         cameras = self.cameras + _start_of_constants(self.layout, self.of_frames(theta.cameras))
-        points = self.points + _start_of_points(self.real, determined, jnp.asarray(theta.points), self.layout.points)
+        points = self.points + _start_of_points(
+            self.real, determined, jnp.asarray(theta.points), self.layout.points
+        )
         return camera.moved(cameras, unknowns.expanded(y[0].T), unknowns), points + y[1]
 
     def as_given(self, cameras: Array) -> Array:
@@ -337,7 +416,9 @@ def _solve_transposed(
 ) -> tuple[SolveInputs, Array]:
     model = _Model.of(layout, slots, cameras, points, inputs)
     unknowns, order, zero = layout.unknowns, layout.points, model.zero
-    seen = jnp.asarray(layout.camera_seen)[:, None] & (jnp.arange(len(zero[0]))[:, None] < model.given)
+    seen = jnp.asarray(layout.camera_seen)[:, None] & (
+        jnp.arange(len(zero[0]))[:, None] < model.given
+    )
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
         """On the unknowns that a minimum determines, orthogonally."""
@@ -358,11 +439,15 @@ def _solve_transposed(
     by_points = of_points * cotangents[1].T[:, jnp.minimum(order, model.real - 1)]
     size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
     (whole,) = pull((cotangents[0].T, by_points))
-    right, whole = project(whole), size(whole)  # where all of it is along the orbit, what is left is rounding
+    # where all of it is along the orbit, what is left is rounding
+    right, whole = project(whole), size(whole)
 
     def along(y: tuple[Array, Array], theta: SolveInputs, step: tuple[Array, Array]) -> Array:
-        """The slope of the cost along a step. Its gradient by y is H step, and by theta step . dg/dtheta."""
-        objective = lambda y: cost(model.with_data(theta), *model.moved(y, theta, determined), options.loss)
+        """The slope of the cost along a step. Its gradient by y is H step, and by theta step .
+        dg/dtheta."""
+        objective = lambda y: cost(
+            model.with_data(theta), *model.moved(y, theta, determined), options.loss
+        )
         return jax.jvp(objective, (y,), (step,))[1]
 
     def product(y: tuple[Array, Array]) -> tuple[tuple[Array, Array], SolveInputs]:
@@ -376,7 +461,9 @@ def _solve_transposed(
     # dL/dtheta = -w . dg/dtheta, and what of the solution is constant passes directly
     direct = jax.vjp(lambda theta: found(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]
     total = jax.tree.map(lambda a, b: b - a, through, direct)
-    return total, jnp.sqrt(jnp.sum(left * left)) / jnp.maximum(whole, jnp.finfo(right[0].dtype).tiny)
+    return total, jnp.sqrt(jnp.sum(left * left)) / jnp.maximum(
+        whole, jnp.finfo(right[0].dtype).tiny
+    )
 
 
 def _conjugate_gradients(
@@ -386,9 +473,10 @@ def _conjugate_gradients(
     tolerance: Array,
     inputs: SolveInputs,
 ) -> tuple[Array, SolveInputs]:
-    """Solves `product(x) = right` to a norm of the residual. Returns the residual, and what else `product` gives of the
-    solution, like `inputs`. `product` and `inverse` stand once in the program, which takes long to compile: the last
-    round of the loop has the solution in the place of a direction."""
+    """Solves `product(x) = right` to a norm of the residual. Returns the residual, and what else
+    `product` gives of the solution, like `inputs`. `product` and `inverse` stand once in the
+    program, which takes long to compile: the last round of the loop has the solution in the place
+    of a direction."""
     flat, unravel = ravel_pytree(right)
 
     def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -405,7 +493,15 @@ def _conjugate_gradients(
 
     zero = jnp.zeros_like(flat)
     nothing = jax.tree.map(jnp.zeros_like, inputs)
-    start = zero, flat, zero, jnp.full((), jnp.inf), jnp.zeros((), jnp.int32), nothing, jnp.asarray(False)
+    start = (
+        zero,
+        flat,
+        zero,
+        jnp.full((), jnp.inf),
+        jnp.zeros((), jnp.int32),
+        nothing,
+        jnp.asarray(False),
+    )
     _, residual, *_, more, _ = jax.lax.while_loop(lambda carry: ~carry[-1], body, start)
     return residual, more
 
@@ -433,7 +529,8 @@ def _start_of_points(real: int, determined: Array, points: Array, order: AnyArra
 def _gauss_newton(
     layout: Layout, cameras: Array, points: Array, options: StepOptions
 ) -> Callable[[tuple[Array, Array]], tuple[Array, Array]]:
-    """`(J^T J + D)^-1` by the Schur complement, as a function of a right-hand side of cameras and points."""
+    """`(J^T J + D)^-1` by the Schur complement, as a function of a right-hand side of cameras and
+    points."""
     linear = only_free(layout, linearize(layout, cameras, points, options.loss), options.intrinsics)
     damping = jnp.asarray(DAMPING, cameras.dtype)
     system = DampedSystem.of(layout, linear, cameras, points, damping, options)

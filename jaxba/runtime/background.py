@@ -1,8 +1,9 @@
 """Programs that a later process will want, compiled by a process of their own after this one.
 
-A call that ran quickly compiled programs for long leaves the fully optimised ones to such a process. It has the lowest
-priority and one core, one at a time works for a folder of programs, and the system ends it after `LIMIT_S` seconds of
-processor time. It gets what to compile through a pipe; nothing that lies on disk is unpickled."""
+A call that ran quickly compiled programs for long leaves the fully optimised ones to such a
+process. It has the lowest priority and one core, one at a time works for a folder of programs, and
+the system ends it after `LIMIT_S` seconds of processor time. It gets what to compile through a
+pipe; nothing that lies on disk is unpickled."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ from jaxba.runtime import compilation
 from jaxba.runtime.executable_cache import PRIVATE
 from jaxba.runtime.numerics import numerics
 
-LIMIT_S = 120  # seconds of processor time after which the process is ended. Those of kitti00vo take fifteen
+# seconds of processor time after which the process is ended. Those of kitti00vo take fifteen
+LIMIT_S = 120
 LOCK = "compiling"  # file of a folder of programs that the process holds locked
 
 
@@ -36,14 +38,18 @@ class Wanted(NamedTuple):
 
 def outline(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     """The arguments with shapes and types in the place of arrays."""
-    typed = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=getattr(x, "weak_type", False))
+    typed = lambda x: jax.ShapeDtypeStruct(
+        x.shape, x.dtype, weak_type=getattr(x, "weak_type", False)
+    )
     return jax.tree.map(lambda x: typed(x) if hasattr(x, "dtype") else x, arguments)
 
 
 def compile_later(wanted: Sequence[Wanted]) -> None:
-    """Begins to compile programs, all for one folder, in a process that outlives this one. Does nothing where that is
-    not possible, as with a function of a user that cannot be pickled."""
-    settings = {name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)}
+    """Begins to compile programs, all for one folder, in a process that outlives this one. Does
+    nothing where that is not possible, as with a function of a user that cannot be pickled."""
+    settings = {
+        name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)
+    }
     with contextlib.suppress(Exception):
         content = pickle.dumps((settings, jnp.result_type(float).name, list(wanted)))
         process = subprocess.Popen(

@@ -1,12 +1,15 @@
-"""How well XLA optimises programs on a CPU: fully, or hardly and in a third to two thirds of the time.
+"""How well XLA optimises programs on a CPU: fully, or hardly and in a third to two thirds of the
+time.
 
-Compiling takes longer than most solves. A program compiled without LLVM's optimisation, and without XLA's newer kernel
-emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
-(`python -m benchmarks.compilation`). So a single solve starts with such programs, and compiles better ones only after
-as many iterations as would have paid for them from the start: as with skis that may be rented or bought, that costs at
-most about twice the better choice. Where programs are kept on disk, better ones that are there are taken from the
-start, and those that are missing are compiled after the solve, by another process (runtime/background.py). The parts of
-a step are programs of their own, since they gain differently, and are compiled in parallel."""
+Compiling takes longer than most solves. A program compiled without LLVM's optimisation, and without
+XLA's newer kernel emitters, whose kernels LLVM takes longest for, computes the same to rounding,
+but two to six times as slowly (`python -m benchmarks.compilation`). So a single solve starts with
+such programs, and compiles better ones only after as many iterations as would have paid for them
+from the start: as with skis that may be rented or bought, that costs at most about twice the better
+choice. Where programs are kept on disk, better ones that are there are taken from the start, and
+those that are missing are compiled after the solve, by another process (runtime/background.py). The
+parts of a step are programs of their own, since they gain differently, and are compiled in
+parallel."""
 
 from __future__ import annotations
 
@@ -30,17 +33,22 @@ from jaxba.runtime.jit import Options, jit, quick_options, right_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-Compilation = Literal["full", "quick", "auto"]  # optimised; hardly; hardly at first, fully once that pays
+# optimised; hardly; hardly at first, fully once that pays
+Compilation = Literal["full", "quick", "auto"]
 Level = Literal["full", "quick"]  # how much one program is optimised
-OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"  # the option that switches XLA's newer kernel emitters off
+# the option that switches XLA's newer kernel emitters off
+OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
 Kind = Literal["factorization", "iterative"]  # how a step solves its linear system
-COMPILE_EVENTS = "/jax/core/compile/"  # prefix of the durations that JAX reports while it traces, lowers and compiles
+# prefix of the durations that JAX reports while it traces, lowers and compiles
+COMPILE_EVENTS = "/jax/core/compile/"
 
 BREAK_EVEN: dict[Kind, int] = {"factorization": 1_200_000, "iterative": 1_000_000}
 """Observations times iterations after which better programs have paid for their compilation, as
-`benchmarks.compilation` measures it. Those of a step are compiled side by side, and so take as long as the first."""
+`benchmarks.compilation` measures it. Those of a step are compiled side by side, and so take as long
+as the first."""
 
-TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}  # iterations that a solve may well take
+# iterations that a solve may well take
+TYPICAL: dict[Kind, int] = {"factorization": 5, "iterative": 8}
 
 
 def quick_iterations(kind: Kind, observations: int) -> int:
@@ -55,16 +63,22 @@ def compiler_options(level: Level) -> Options:
 
 
 class Program:
-    """A function compiled by `jax.jit` at a level, for every shape of its arguments, which are given by position."""
+    """A function compiled by `jax.jit` at a level, for every shape of its arguments, which are
+    given by position."""
 
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
         self.options = right_options() | compiler_options(level)
         self._fast = OLDER_EMITTERS in self.options  # for these `fast_compilation` is made
         self._jitted = jax.jit(
-            _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
+            _strongly_typed(function),
+            static_argnames=static,
+            compiler_options=self.options,
+            keep_unused=True,
         )
-        self._static = [name if name in static else None for name in inspect.signature(function).parameters]
+        self._static = [
+            name if name in static else None for name in inspect.signature(function).parameters
+        ]
 
     def __call__(self, *arguments: Any) -> Any:
         with fast_compilation(self._fast):
@@ -83,7 +97,8 @@ class Program:
 
 
 def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function without weakly typed results, for which a program that takes them would be compiled once more."""
+    """The function without weakly typed results, for which a program that takes them would be
+    compiled once more."""
 
     @functools.wraps(function)
     def strong(*arguments: Any, **named: Any) -> Any:
@@ -95,8 +110,9 @@ def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def program(function: Callable[..., Any], *static: str, level: Level = "full") -> Program:
-    """The program of a function: one and the same for equal arguments. `static` names the function's static arguments;
-    the level is full where XLA does not know the options of a lower one."""
+    """The program of a function: one and the same for equal arguments. `static` names the
+    function's static arguments; the level is full where XLA does not know the options of a lower
+    one."""
     return Program(function, static, level)
 
 
@@ -104,8 +120,9 @@ _cache: ExecutableCache | None = None
 
 
 def use_cache(folder: Path | None) -> None:
-    """Makes `ParallelCompilation` keep programs of one device in a folder, which nobody else may write to; None: no
-    longer. JAX's own compilation cache excludes this one: a program that JAX has read cannot be written again."""
+    """Makes `ParallelCompilation` keep programs of one device in a folder, which nobody else may
+    write to; None: no longer. JAX's own compilation cache excludes this one: a program that JAX has
+    read cannot be written again."""
     global _cache
     _cache = None if folder is None else ExecutableCache(folder)
 
@@ -116,12 +133,13 @@ def has_cache() -> bool:
 
 
 class ParallelCompilation:
-    """A context in which programs are compiled in parallel, and not run; `run` then runs them without compiling.
+    """A context in which programs are compiled in parallel, and not run; `run` then runs them
+    without compiling.
 
-    XLA compiles one program on little more than one core. The thread that leaves the context compiles what is still
-    waiting; it is the one that runs the programs, so that the memory that compiling took is reused for running
-    (`process.keep_memory`). The context may be entered again for more programs. A program is compiled once, for the
-    arguments that it was given first.
+    XLA compiles one program on little more than one core. The thread that leaves the context
+    compiles what is still waiting; it is the one that runs the programs, so that the memory that
+    compiling took is reused for running (`process.keep_memory`). The context may be entered again
+    for more programs. A program is compiled once, for the arguments that it was given first.
 
     Args:
         ahead: whether programs that may be wanted are compiled, too, and not only read."""
@@ -130,11 +148,12 @@ class ParallelCompilation:
         self._ahead = ahead
         self.loaded: dict[Program, CachedExecutable] = {}  # programs that were read from disk
         self._verified: set[Program] = set()  # of these, the ones that have run once
-        # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
-        # disk, which are bound to a device
+        # called as compiled, not by `jit`: that would compile once more for results of programs
+        # that were read from disk, which are bound to a device
         self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
-        self.late_s = 0.0  # seconds in which `run` has compiled programs that nobody had asked for before
+        # seconds in which `run` has compiled programs that nobody had asked for before
+        self.late_s = 0.0
 
     def __enter__(self) -> ParallelCompilation:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
@@ -143,14 +162,15 @@ class ParallelCompilation:
         return self
 
     def __call__(self, function: Program, *arguments: Any) -> Any:
-        """Starts to compile a program for arguments that are arrays, or their shapes and types, and static ones.
-        Returns shapes and types of its results, to be arguments of the next."""
+        """Starts to compile a program for arguments that are arrays, or their shapes and types, and
+        static ones. Returns shapes and types of its results, to be arguments of the next."""
         if function not in self._results:
             self._results[function] = self._begin(function, *arguments)
         return self._results[function]
 
     def read(self, function: Program, *arguments: Any) -> None:
-        """Starts to read a program that may be wanted, if it is on disk; `ahead`, also to compile it."""
+        """Starts to read a program that may be wanted, if it is on disk; `ahead`, also to compile
+        it."""
         path = self.path(function, *arguments)
         if self._ahead or (path and path.exists()):
             self(function, *arguments)
@@ -177,7 +197,8 @@ class ParallelCompilation:
         return out
 
     def run(self, function: Program, *arguments: Any) -> Any:
-        """What the program computes. It is compiled now, or read from disk, if the context has not had it."""
+        """What the program computes. It is compiled now, or read from disk, if the context has not
+        had it."""
         if function not in self._results:
             started = time.perf_counter()
             with self:
@@ -202,7 +223,8 @@ class ParallelCompilation:
         return result
 
     def path(self, function: Program, *arguments: Any) -> Path | None:
-        """The file of a program for arguments as for a call, whether it exists or not; None if it is not kept."""
+        """The file of a program for arguments as for a call, whether it exists or not; None if it
+        is not kept."""
         if _cache is None or jax.config.values.get("jax_compilation_cache_dir"):
             return None
         return _cache.path_for(function.function, *function.split(arguments), function.options)
@@ -227,23 +249,27 @@ class ParallelCompilation:
 
 
 def compile_and_run(function: Program, *arguments: Any) -> Any:
-    """What a program computes, for one that runs once; it is read from the cache of `use_cache` if it is there."""
-    return function(*arguments) if _cache is None else ParallelCompilation().run(function, *arguments)
+    """What a program computes, for one that runs once; it is read from the cache of `use_cache` if
+    it is there."""
+    return (
+        function(*arguments) if _cache is None else ParallelCompilation().run(function, *arguments)
+    )
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:
-    """Decorates a function that a program contains several times: it is traced once for arguments of equal types.
+    """Decorates a function that a program contains several times: it is traced once for arguments
+    of equal types.
 
-    XLA inlines the calls, so that the program is the same; without it two fifths of the time to trace a step went into
-    tracing the same functions again. `static` names its static arguments."""
+    XLA inlines the calls, so that the program is the same; without it two fifths of the time to
+    trace a step went into tracing the same functions again. `static` names its static arguments."""
     return lambda function: cast(Function, jit(function, static_argnames=static))
 
 
 class CompileClock:
     """Adds up the time that JAX spends on tracing and compiling while its context is open.
 
-    `seconds` may be read at any moment. Compilation in other threads counts too. Tracing one function inside another is
-    reported by both, so the sum can slightly exceed the wall time."""
+    `seconds` may be read at any moment. Compilation in other threads counts too. Tracing one
+    function inside another is reported by both, so the sum can slightly exceed the wall time."""
 
     def __init__(self) -> None:
         self.seconds = 0.0

@@ -1,7 +1,8 @@
-"""Several processes and several devices: JAX's own runtime, which has to be started before anything is computed.
+"""Several processes and several devices: JAX's own runtime, which has to be started before anything
+is computed.
 
-All processes run the same program on the same arguments. Where only the first may act, since it reads or writes files,
-`together` hands what it found to the others."""
+All processes run the same program on the same arguments. Where only the first may act, since it
+reads or writes files, `together` hands what it found to the others."""
 
 from __future__ import annotations
 
@@ -26,11 +27,17 @@ T = TypeVar("T")
 
 START_S = 300  # seconds that processes wait for each other at the start. JAX's default
 PATIENCE_S = 5  # seconds after which a process says that it waits for others at the start
-HEARTBEAT_S = 30  # seconds of silence after which a process counts as dead and JAX ends the others; its default is 100
-WAIT_MS = 1 << 30  # twelve days, for which processes wait for the first one; Gloo's collectives wait half an hour
-THREADS = 8  # of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill
+# seconds of silence after which a process counts as dead and JAX ends the others; its default is
+# 100
+HEARTBEAT_S = 30
+# twelve days, for which processes wait for the first one; Gloo's collectives wait half an hour
+WAIT_MS = 1 << 30
+# of XLA for each virtual device. With one for each, two and four devices on two cores came to a
+# standstill
+THREADS = 8
 BLOCK = 1 << 24  # bytes that are sent to other processes at once
-LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")  # in errors where a process is gone
+# in errors where a process is gone
+LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")
 
 _done = itertools.count()
 
@@ -39,26 +46,34 @@ class MainFailedError(Exception):
     """The first process has failed, and says why itself."""
 
 
-def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
-    """Connects this process with the others, before any computation with JAX. On CPUs they talk by gloo.
+def initialize(
+    coordinator: str | None = None, processes: int | None = None, process: int | None = None
+) -> None:
+    """Connects this process with the others, before any computation with JAX. On CPUs they talk by
+    gloo.
 
-    Where not all have started after `START_S` the process ends with one line. The coordinator is `HOST:PORT` of the
-    first process, on a port that is free there; processes have numbers from 0. Without all three JAX finds them under
-    Slurm, Open MPI and Kubernetes. Raises InputError: bad arguments, none were found, or the first process cannot use
-    its port. Raises RuntimeError: JAX has computed already."""
+    Where not all have started after `START_S` the process ends with one line. The coordinator is
+    `HOST:PORT` of the first process, on a port that is free there; processes have numbers from 0.
+    Without all three JAX finds them under Slurm, Open MPI and Kubernetes. Raises InputError: bad
+    arguments, none were found, or the first process cannot use its port. Raises RuntimeError: JAX
+    has computed already."""
     given = [x is not None for x in (coordinator, processes, process)]
     if any(given) and not all(given):
-        raise InputError("coordinator, number of processes and number of this process must be given together")
+        raise InputError(
+            "coordinator, number of processes and number of this process must be given together"
+        )
     if coordinator is not None and processes is not None and process is not None:
         _check(coordinator, processes, process)
-    jax.config.update("jax_enable_preemption_service", False)  # it would catch SIGTERM, and the process live on
+    # it would catch SIGTERM, and the process live on
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         with _deadline(START_S):
             jax.distributed.initialize(
                 coordinator,
                 processes,
                 process,
-                initialization_timeout=2 * START_S,  # at whose end it would abort the process with a stack trace
+                # at whose end it would abort the process with a stack trace
+                initialization_timeout=2 * START_S,
                 heartbeat_timeout_seconds=HEARTBEAT_S,
             )
     except ValueError as error:
@@ -67,10 +82,15 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
 
 @contextlib.contextmanager
 def _deadline(seconds: float) -> Iterator[None]:
-    """In which processes wait for each other: says so after a while, and ends this one at the deadline."""
+    """In which processes wait for each other: says so after a while, and ends this one at the
+    deadline."""
 
     def give_up() -> None:
-        print(f"error: not all processes of this run have started in {seconds:g} s", file=sys.stderr, flush=True)
+        print(
+            f"error: not all processes of this run have started in {seconds:g} s",
+            file=sys.stderr,
+            flush=True,
+        )
         os._exit(2)
 
     say = lambda: print("note: waiting for the other processes", file=sys.stderr, flush=True)
@@ -102,7 +122,8 @@ def _check(coordinator: str, processes: int, process: int) -> None:
 
 
 def is_main() -> bool:
-    """Whether this is the first process, which alone prints and writes. Starts JAX: `use_devices` comes before."""
+    """Whether this is the first process, which alone prints and writes. Starts JAX: `use_devices`
+    comes before."""
     return not jax.distributed.is_initialized() or jax.process_index() == 0
 
 
@@ -114,8 +135,9 @@ def has_lost_process(error: BaseException) -> bool:
 def use_devices(count: int | None) -> list[jax.Device]:
     """The first devices of every process, in the order of the processes.
 
-    A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked for. `count` is
-    that of each process; None: one, or all with several processes. Raises InputError: a process has fewer."""
+    A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked
+    for. `count` is that of each process; None: one, or all with several processes. Raises
+    InputError: a process has fewer."""
     if count is not None:
         count = int(count)
         if count < 1:
@@ -136,7 +158,8 @@ def use_devices(count: int | None) -> list[jax.Device]:
 
 @contextlib.contextmanager
 def _threads(count: int) -> Iterator[None]:
-    """In which JAX starts with so many of XLA's threads for virtual devices, unless it has started or NPROC is set.
+    """In which JAX starts with so many of XLA's threads for virtual devices, unless it has started
+    or NPROC is set.
 
     Devices share them: with few, batched factorisations of several wait for each other for ever."""
     if count <= THREADS or "NPROC" in os.environ:
@@ -150,8 +173,9 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def together(work: Callable[[], T]) -> T:
-    """Runs a function in the first process and returns its result in every process; the others wait. Raises
-    MainFailedError: in the other processes, if it raised an error; the first process raises that error itself."""
+    """Runs a function in the first process and returns its result in every process; the others
+    wait. Raises MainFailedError: in the other processes, if it raised an error; the first process
+    raises that error itself."""
     if not jax.distributed.is_initialized() or jax.process_count() == 1:
         return work()
     client: Any = runtime.global_state.client
@@ -188,8 +212,8 @@ def _broadcast(content: bytes, buffers: Sequence[Any]) -> tuple[bytes, Sequence[
 
 
 def _send(buffers: Sequence[Any]) -> None:
-    """Fills the buffers of all other processes with those of the first one, block by block: JAX copies what it sends
-    several times."""
+    """Fills the buffers of all other processes with those of the first one, block by block: JAX
+    copies what it sends several times."""
     for buffer in buffers:
         whole = np.frombuffer(buffer, np.uint8)
         for start in range(0, len(whole), BLOCK):
@@ -208,7 +232,11 @@ def gather(values: list[T]) -> list[T]:
     padded = np.zeros(int(sizes.max()), np.uint8)
     padded[: len(content)] = content
     parts = np.asarray(multihost_utils.process_allgather(padded)).reshape(len(sizes), -1)
-    return [one for part, size in zip(parts, sizes, strict=True) for one in pickle.loads(part[:size].tobytes())]
+    return [
+        one
+        for part, size in zip(parts, sizes, strict=True)
+        for one in pickle.loads(part[:size].tobytes())
+    ]
 
 
 def to_host(x: Any) -> np.ndarray:

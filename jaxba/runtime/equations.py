@@ -1,4 +1,5 @@
-"""The graph of a program's equations, some of whose values differ between the parts of its data (parts.py)."""
+"""The graph of a program's equations, some of whose values differ between the parts of its data
+(parts.py)."""
 
 from __future__ import annotations
 
@@ -73,8 +74,8 @@ def nodes_of(values: Iterable[Value]) -> list[Node]:
 
 
 def prepared(values: Iterable[Value]) -> list[Value]:
-    """The stored divided values of which values are made. Computes the common ones, which must not be done inside of a
-    loop, where they would be of that loop."""
+    """The stored divided values of which values are made. Computes the common ones, which must not
+    be done inside of a loop, where they would be of that loop."""
     seen: dict[Value, None] = {}
     stack = list(values)
     while stack:
@@ -94,7 +95,11 @@ def common(value: Value) -> Any:
     stack = [value.node]
     while stack:
         node = stack[-1]
-        missing = [one.node for one in node.inputs if one.node.stored is None] if node.stored is None else []
+        missing = (
+            [one.node for one in node.inputs if one.node.stored is None]
+            if node.stored is None
+            else []
+        )
         if missing:
             stack += missing
             continue
@@ -115,7 +120,9 @@ def inside(value: Value, local: dict[Value, Any]) -> Any:
             continue
         stack.pop()
         if one not in local:
-            found = evaluated(one.node, [local[x] if x.divided else x.get() for x in one.node.inputs])
+            found = evaluated(
+                one.node, [local[x] if x.divided else x.get() for x in one.node.inputs]
+            )
             local.update({Value(one.node, k, True): x for k, x in enumerate(found)})
     return local[value] if value.divided else value.get()
 

@@ -1,11 +1,12 @@
 """Compiled programs on disk, found without tracing them.
 
-JAX's own compilation cache needs a program's text, which takes tracing and lowering: two thirds of what is left of
-compilation where every program is cached. Here the key is what the text follows from: the function, the types of its
-arguments, its static arguments, this package's source, and JAX; `distrust.programs_folder` has a folder for each kind
-of processor and jaxlib. A file has one line of JSON with the types of the results, and the executable as XLA writes and
-reads it; nothing else in it is ever run. It is compressed by lzma: in a process that imports pycolmap before zlib, zlib
-of Python crashes (pycolmap 4.2 brings its own)."""
+JAX's own compilation cache needs a program's text, which takes tracing and lowering: two thirds of
+what is left of compilation where every program is cached. Here the key is what the text follows
+from: the function, the types of its arguments, its static arguments, this package's source, and
+JAX; `distrust.programs_folder` has a folder for each kind of processor and jaxlib. A file has one
+line of JSON with the types of the results, and the executable as XLA writes and reads it; nothing
+else in it is ever run. It is compressed by lzma: in a process that imports pycolmap before zlib,
+zlib of Python crashes (pycolmap 4.2 brings its own)."""
 
 from __future__ import annotations
 
@@ -35,9 +36,13 @@ from jaxba.runtime.atomic import atomic_write
 
 SUFFIX = ".jaxba-program"
 
-LIMIT = 1 << 30  # bytes that a folder's programs may have; the least recently used are removed first
-IN_MEMORY = 128  # programs read from disk that a process keeps: a solve has seven, and a mapper's adjuster many sizes
-PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")  # settings of JAX that change no program
+# bytes that a folder's programs may have; the least recently used are removed first
+LIMIT = 1 << 30
+# programs read from disk that a process keeps: a solve has seven, and a mapper's adjuster many
+# sizes
+IN_MEMORY = 128
+# settings of JAX that change no program
+PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
 
 
 class CachedExecutable(NamedTuple):
@@ -49,7 +54,8 @@ class CachedExecutable(NamedTuple):
 
 
 class ExecutableCache:
-    """Programs in a folder. Like JAX's cache it holds native code: use a folder that nobody else writes to."""
+    """Programs in a folder. Like JAX's cache it holds native code: use a folder that nobody else
+    writes to."""
 
     def __init__(self, folder: Path) -> None:
         """For programs in a folder; that it can be written is not needed."""
@@ -57,41 +63,54 @@ class ExecutableCache:
         self._source = _source()  # read now: the files may be edited while the process goes on
 
     def path_for(
-        self, function: Callable[..., Any], static: dict[str, Any], arguments: tuple[Any, ...], options: Any = None
+        self,
+        function: Callable[..., Any],
+        static: dict[str, Any],
+        arguments: tuple[Any, ...],
+        options: Any = None,
     ) -> Path | None:
-        """The file of a program, whether it exists or not. What a function of this package computes follows from its
-        arguments and the source; `static` are its static arguments by name, `arguments` the others in their order,
-        pytrees of arrays or of shapes and types, and `options` are XLA's for this program. None where the key would not
-        determine the program: where a function or class from outside this package is part of it, a user's own damping
-        rule for instance."""
+        """The file of a program, whether it exists or not. What a function of this package computes
+        follows from its arguments and the source; `static` are its static arguments by name,
+        `arguments` the others in their order, pytrees of arrays or of shapes and types, and
+        `options` are XLA's for this program. None where the key would not determine the program:
+        where a function or class from outside this package is part of it, a user's own damping rule
+        for instance."""
         try:
             leaves, tree = jax.tree.flatten(arguments)
             key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
             weak = lambda leaf: "weak" if getattr(leaf, "weak_type", False) else ""
-            typed = lambda x: f"{x.dtype}{x.shape}{weak(x)}" if hasattr(x, "dtype") else type(x).__name__
+            typed = lambda x: (
+                f"{x.dtype}{x.shape}{weak(x)}" if hasattr(x, "dtype") else type(x).__name__
+            )
             key += map(typed, leaves)
         except _UnknownSource:
             return None
-        digest = hashlib.sha256("\n".join([*key, _environment(), self._source]).encode()).hexdigest()
+        digest = hashlib.sha256(
+            "\n".join([*key, _environment(), self._source]).encode()
+        ).hexdigest()
         return self.folder / f"{function.__name__}-{digest[:40]}{SUFFIX}"
 
     def load(self, path: Path | None) -> CachedExecutable | None:
-        """The program of a file, which `path_for` returned; None where there is none, or none that can be read."""
+        """The program of a file, which `path_for` returned; None where there is none, or none that
+        can be read."""
         if path is None or not path.is_file():
             return None
         try:
             stored = _load(path)
-        except Exception:  # of another version, damaged, or gone: it is compiled anew and overwritten
+        # of another version, damaged, or gone: it is compiled anew and overwritten
+        except Exception:
             return None
         with contextlib.suppress(OSError):  # the folder may belong to another user
             os.utime(path)
         return stored
 
     def save(self, path: Path | None, compiled: jax.stages.Compiled, out: Any) -> None:
-        """Writes a program to the path of `path_for`, whole or not at all; does nothing if it cannot be written.
+        """Writes a program to the path of `path_for`, whole or not at all; does nothing if it
+        cannot be written.
 
-        It must be compiled in this process (`watch_compilation`): one that JAX has read from its own cache is
-        serialised without some of its functions. `out` are shapes and types of its results."""
+        It must be compiled in this process (`watch_compilation`): one that JAX has read from its
+        own cache is serialised without some of its functions. `out` are shapes and types of its
+        results."""
         if path is None:
             return
         try:
@@ -141,7 +160,8 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
         monitoring.unregister_event_duration_listener(listen)
 
 
-_readers = ThreadPoolExecutor(max_workers=2)  # read programs, XLA each in 0.1 s, while others are looked for
+# read programs, XLA each in 0.1 s, while others are looked for
+_readers = ThreadPoolExecutor(max_workers=2)
 
 
 @functools.lru_cache(maxsize=IN_MEMORY)
@@ -151,8 +171,11 @@ def _load(path: Path) -> CachedExecutable:
     process.register_lapack()
     device = jax.devices()[0]
     devices = xla_client.DeviceList((device,))
-    reading = _readers.submit(device.client.deserialize_executable, code, executable_devices=devices)
-    put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(x, device)  # all arrays are on this device
+    reading = _readers.submit(
+        device.client.deserialize_executable, code, executable_devices=devices
+    )
+    # all arrays are on this device
+    put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(x, device)
 
     def run(*arguments: Any) -> Any:
         results = reading.result().execute_sharded([put(x) for x in jax.tree.leaves(arguments)])
@@ -211,9 +234,11 @@ def _describe(value: Any) -> str:
     if isinstance(value, (tuple, list)):
         return f"({', '.join(map(_describe, value))})"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{_describe(key)}: {_describe(value[key])}' for key in sorted(value))}}}"
+        items = (f"{_describe(key)}: {_describe(value[key])}" for key in sorted(value))
+        return f"{{{', '.join(items)}}}"
     if isinstance(known := getattr(value, "source", None), str) and known:
-        return f"{_name(type(value))}({known})"  # of a function from elsewhere, which has been traced
+        # of a function from elsewhere, which has been traced
+        return f"{_name(type(value))}({known})"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return f"{_name(type(value))}{_describe(dict(fields))}"
@@ -230,14 +255,22 @@ def _describe_tree(tree: Any) -> str:
     if node is None:
         return "*"
     kind, metadata = node
-    return f"{_name(kind)} {_describe(metadata)} [{', '.join(map(_describe_tree, tree.children()))}]"
+    return (
+        f"{_name(kind)} {_describe(metadata)} [{', '.join(map(_describe_tree, tree.children()))}]"
+    )
 
 
 def _environment() -> str:
-    """Everything outside a program that decides how it is compiled: JAX's settings, XLA's flags, the machine."""
-    settings = {name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)}
+    """Everything outside a program that decides how it is compiled: JAX's settings, XLA's flags,
+    the machine."""
+    settings = {
+        name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)
+    }
     settings["float"] = jnp.result_type(float)  # whether this thread has x64 on
-    devices = [f"{device.platform} {device.device_kind} {device.client.platform_version}" for device in jax.devices()]
+    devices = [
+        f"{device.platform} {device.device_kind} {device.client.platform_version}"
+        for device in jax.devices()
+    ]
     flags = os.environ.get("XLA_FLAGS", "")
     return f"{sorted(settings.items())}\n{flags}\n{devices}\n{jax.__version__} {os.cpu_count()}"
 

@@ -12,15 +12,16 @@ from jax import Array, lax
 
 T = TypeVar("T")
 
-GROUP = 8  # scenes that step together on a CPU, in a core's cache: 64 scenes of 10 x 40 took no less time each
+# scenes that step together on a CPU, in a core's cache: 64 scenes of 10 x 40 took no less time each
+GROUP = 8
 
 
 def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None) -> T:
     """`jax.vmap(function)` in groups of `GROUP`, one after the other, on a CPU; at once elsewhere.
 
-    Under `jax.vmap` the groups stay as large and there are more of them. `function` is of one scene, and gets `shared`,
-    arrays that all scenes share, first if that is not None. The arguments have a first axis of scenes. Under `jax.vmap`
-    the function must not close over other arrays."""
+    Under `jax.vmap` the groups stay as large and there are more of them. `function` is of one
+    scene, and gets `shared`, arrays that all scenes share, first if that is not None. The arguments
+    have a first axis of scenes. Under `jax.vmap` the function must not close over other arrays."""
     if jax.default_backend() != "cpu":
         return _at_once(function, shared, arguments)
 
@@ -50,10 +51,12 @@ def _grouped(function: Callable[..., T], shared: Any, arguments: Any) -> T:
     count = jax.tree.leaves(arguments)[0].shape[0]
     if count <= GROUP:
         return _at_once(function, shared, arguments)
-    # whole groups only: `lax.map` would run the remainder at the same time as the groups, and two batched
-    # factorisations at a time can deadlock if XLA has two threads
+    # whole groups only: `lax.map` would run the remainder at the same time as the groups, and two
+    # batched factorisations at a time can deadlock if XLA has two threads
     rows = jnp.minimum(jnp.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
-    found = lax.map(lambda a: _at_once(function, shared, a), jax.tree.map(lambda x: x[rows], arguments))
+    found = lax.map(
+        lambda a: _at_once(function, shared, a), jax.tree.map(lambda x: x[rows], arguments)
+    )
     return jax.tree.map(lambda x: _joined(x)[:count], found)
 
 

@@ -1,7 +1,7 @@
 """The name of the game for `gymnasium.make`.
 
-Since version 1.0 Gymnasium looks for no entry points: an environment is known once something registers it. Its names
-are strings, so that nothing of the game is loaded here."""
+Since version 1.0 Gymnasium looks for no entry points: an environment is known once something
+registers it. Its names are strings, so that nothing of the game is loaded here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Ctrl-C and SIGTERM in a command: one line at the end, and work under way that is finished first."""
+"""Ctrl-C and SIGTERM in a command: one line at the end, and work under way that is finished
+first."""
 
 from __future__ import annotations
 
@@ -14,28 +15,37 @@ from typing import Any
 
 INTERRUPTED = 128 + signal.SIGINT  # exit status after Ctrl-C, as shells define it
 TERMINATED = 128 + signal.SIGTERM  # exit status after SIGTERM
-ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}  # last line of a command that a signal has ended
-SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}  # and what stops at once after one
-EXIT_DELAY_S = 1.0  # seconds from a second signal to the end; Python handles none while a compiled program runs
-RAISE_AGAIN_S = 0.01  # seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended
-_HANDLED = 0  # byte that the handler sends to the thread when it raises KeyboardInterrupt; no signal's number
+# last line of a command that a signal has ended
+ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}
+# and what stops at once after one
+SIGNALS = {signal.SIGINT: "Ctrl-C again", signal.SIGTERM: "another signal"}
+# seconds from a second signal to the end; Python handles none while a compiled program runs
+EXIT_DELAY_S = 1.0
+# seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended
+RAISE_AGAIN_S = 0.01
+# byte that the handler sends to the thread when it raises KeyboardInterrupt; no signal's number
+_HANDLED = 0
 
 
 class Interrupt:
-    """Context manager. While `graceful`, the first Ctrl-C or SIGTERM only sets `requested`, and the second raises
-    KeyboardInterrupt; otherwise each one raises it. A signal that is ignored, as Ctrl-C is under `nohup`, stays so.
-    Nothing is changed in a thread other than the first, where signals are not handled.
+    """Context manager. While `graceful`, the first Ctrl-C or SIGTERM only sets `requested`, and the
+    second raises KeyboardInterrupt; otherwise each one raises it. A signal that is ignored, as
+    Ctrl-C is under `nohup`, stays so. Nothing is changed in a thread other than the first, where
+    signals are not handled.
 
-    With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a compiled
-    program the first one prints a message, and the second ends the process: files are atomic."""
+    With a `unit` a thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even
+    during a compiled program the first one prints a message, and the second ends the process: files
+    are atomic."""
 
     status = 0  # exit status after the signal that came last; 0 before any
 
     def __init__(self, unit: str = "", *, graceful: bool = False) -> None:
-        """Does nothing yet. `unit` is what is finished after the first signal, for the message, e.g. `iteration`.
-        Without it, signals that have a handler already are left alone. `graceful` can be changed later."""
+        """Does nothing yet. `unit` is what is finished after the first signal, for the message,
+        e.g. `iteration`. Without it, signals that have a handler already are left alone. `graceful`
+        can be changed later."""
         self.unit, self.graceful, self.requested = unit, graceful, False
-        # signals that the thread and the handler have seen; Python calls the handler once for several signals
+        # signals that the thread and the handler have seen; Python calls the handler once for
+        # several signals
         self._received, self._handled = 0, 0
         self._message = [True]  # empty when the message has been printed
         self._sender: socket.socket | None = None
@@ -43,15 +53,22 @@ class Interrupt:
     def __enter__(self) -> Interrupt:
         main_thread = threading.current_thread() is threading.main_thread()
         unhandled = (signal.default_int_handler, signal.SIG_DFL)
-        replaces = lambda handler: handler in unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
+        replaces = lambda handler: (
+            handler in unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
+        )
         ours = [number for number in SIGNALS if main_thread and replaces(signal.getsignal(number))]
         self._previous = {number: signal.signal(number, self._handle) for number in ours}
-        self._previous_hook, sys.unraisablehook = sys.unraisablehook, self._raise_again if ours else sys.unraisablehook
+        self._previous_hook, sys.unraisablehook = (
+            sys.unraisablehook,
+            self._raise_again if ours else sys.unraisablehook,
+        )
         if not (ours and self.unit):
             return self
         self._receiver, self._sender = socket.socketpair()
         self._sender.setblocking(False)
-        self._previous_wakeup = signal.set_wakeup_fd(self._sender.fileno(), warn_on_full_buffer=False)
+        self._previous_wakeup = signal.set_wakeup_fd(
+            self._sender.fileno(), warn_on_full_buffer=False
+        )
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
         return self
@@ -71,7 +88,9 @@ class Interrupt:
         """Runs in the thread: receives signals until the socket is closed."""
         deadline = None
         while True:
-            self._receiver.settimeout(None if deadline is None else max(1e-3, deadline - time.monotonic()))
+            self._receiver.settimeout(
+                None if deadline is None else max(1e-3, deadline - time.monotonic())
+            )
             try:
                 numbers = self._receiver.recv(1)
             except TimeoutError:
@@ -109,10 +128,13 @@ class Interrupt:
         except IndexError:
             return
         again = SIGNALS[signal.Signals(number)]
-        print(f"stopping after this {self.unit}; {again} stops at once", file=sys.stderr, flush=True)
+        print(
+            f"stopping after this {self.unit}; {again} stops at once", file=sys.stderr, flush=True
+        )
 
     def _raise_again(self, lost: Any) -> None:
-        """Python drops an exception in a callback of the garbage collector, of which JAX has one: raise it later."""
+        """Python drops an exception in a callback of the garbage collector, of which JAX has one:
+        raise it later."""
         if lost.exc_type is KeyboardInterrupt:
             threading.Timer(RAISE_AGAIN_S, _thread.interrupt_main, [self.status - 128]).start()
         else:

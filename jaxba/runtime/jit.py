@@ -1,8 +1,9 @@
 """`jax.jit` with the options of XLA without which programs may compute wrong numbers.
 
-From jaxlib 0.10.2 on XLA gives products and sums of a program on a CPU to YNNPACK, and some of them come back wrong
-without a word: `vmap(lambda x: jnp.sum((M @ x) ** 2))` from 16,385 rows on, in jaxlib 0.10.2 (jax-ml/jax#39103); others
-crash (#39257). `tests/runtime/test_jit.py` shows on which versions this still is so."""
+From jaxlib 0.10.2 on XLA gives products and sums of a program on a CPU to YNNPACK, and some of them
+come back wrong without a word: `vmap(lambda x: jnp.sum((M @ x) ** 2))` from 16,385 rows on, in
+jaxlib 0.10.2 (jax-ml/jax#39103); others crash (#39257). `tests/runtime/test_jit.py` shows on which
+versions this still is so."""
 
 from __future__ import annotations
 
@@ -15,8 +16,10 @@ from jax._src.core import trace_state_clean  # it has no public name
 
 Options = dict[str, bool | int | str]
 
-RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}  # of all programs on a CPU: no fusions for YNNPACK
-QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}  # 0.12 lacks the latter
+# of all programs on a CPU: no fusions for YNNPACK
+RIGHT: Options = {"xla_cpu_experimental_ynn_fusion_type": ""}
+# 0.12 lacks the latter
+QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 @functools.cache
@@ -49,10 +52,14 @@ def _are_known(options: Options) -> bool:
 class jit:
     """`jax.jit`, compiled with `right_options`.
 
-    JAX takes options for whole programs: what is called inside another one, or a transformation, has its options."""
+    JAX takes options for whole programs: what is called inside another one, or a transformation,
+    has its options."""
 
-    def __init__(self, function: Callable[..., Any], *, once: bool = False, **settings: Any) -> None:
-        """`function` is what it computes, `settings` are those of `jax.jit`. What runs `once` is hardly optimised."""
+    def __init__(
+        self, function: Callable[..., Any], *, once: bool = False, **settings: Any
+    ) -> None:
+        """`function` is what it computes, `settings` are those of `jax.jit`. What runs `once` is
+        hardly optimised."""
         functools.update_wrapper(self, function)
         self._part = jax.jit(function, **settings)
         self._settings, self._once = settings, once

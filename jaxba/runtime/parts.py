@@ -1,13 +1,15 @@
 """A program over the parts of its data, one part after the other: memory for one part at a time.
 
-`in_turns(function, ...)` is `jax.vmap(function, axis_name=...)` without the batch. Values that differ between the parts
-are *divided*; all others, sums and maxima over the axis (`lax.psum`, `lax.pmax`) among them, are *common* and computed
-once. What is divided is not stored: it is computed again, part by part, in each pass over the parts in which something
-is summed. Sums of which none needs another one are one pass. Stored are only results, the state of loops, and values
-that are `kept`. So a loop with a sum in it, as of conjugate gradients, passes over the parts in each iteration.
+`in_turns(function, ...)` is `jax.vmap(function, axis_name=...)` without the batch. Values that
+differ between the parts are *divided*; all others, sums and maxima over the axis (`lax.psum`,
+`lax.pmax`) among them, are *common* and computed once. What is divided is not stored: it is
+computed again, part by part, in each pass over the parts in which something is summed. Sums of
+which none needs another one are one pass. Stored are only results, the state of loops, and values
+that are `kept`. So a loop with a sum in it, as of conjugate gradients, passes over the parts in
+each iteration.
 
-The program is traced once, as for one part, and becomes a graph of its equations. A value's *level* is the number of
-sums that it depends on, one after the other; passes are made level by level."""
+The program is traced once, as for one part, and becomes a graph of its equations. A value's *level*
+is the number of sums that it depends on, one after the other; passes are made level by level."""
 
 from __future__ import annotations
 
@@ -21,7 +23,16 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
 
 from jaxba.runtime import loops
-from jaxba.runtime.equations import KEPT, Node, Value, common, given_value, inside, nodes_of, prepared
+from jaxba.runtime.equations import (
+    KEPT,
+    Node,
+    Value,
+    common,
+    given_value,
+    inside,
+    nodes_of,
+    prepared,
+)
 from jaxba.runtime.fusion import compute_unfused
 
 _SUMS: dict[str, Callable[[Any, Any], Any]] = {"psum": jnp.add, "pmax": jnp.maximum}
@@ -33,11 +44,14 @@ def kept(values: Any) -> Any:
     return jax.tree.map(lambda x: checkpoint_name(x, KEPT), values)
 
 
-def in_turns(function: Callable[..., Any], axis: str, arguments: tuple[Any, ...], divided: Any, outputs: Any) -> Any:
-    """`function(*arguments)` over the parts of its divided arguments, with sums over the axis of this name.
+def in_turns(
+    function: Callable[..., Any], axis: str, arguments: tuple[Any, ...], divided: Any, outputs: Any
+) -> Any:
+    """`function(*arguments)` over the parts of its divided arguments, with sums over the axis of
+    this name.
 
-    Returns the results; those that are divided have a leading axis of one entry a part. Raises ValueError: a result
-    that should be common differs between the parts.
+    Returns the results; those that are divided have a leading axis of one entry a part. Raises
+    ValueError: a result that should be common differs between the parts.
 
     Args:
         function: of one part; its results are pytrees of arrays.
@@ -49,7 +63,9 @@ def in_turns(function: Callable[..., Any], axis: str, arguments: tuple[Any, ...]
     apart = _spread(divided, arguments)
     parts = next(len(x) for x, one in zip(leaves, apart, strict=True) if one)
     given = [jnp.asarray(x) for x in leaves]
-    shapes = [jax.ShapeDtypeStruct(x.shape[one:], x.dtype) for x, one in zip(given, apart, strict=True)]
+    shapes = [
+        jax.ShapeDtypeStruct(x.shape[one:], x.dtype) for x, one in zip(given, apart, strict=True)
+    ]
     flat = lambda *each: function(*jax.tree.unflatten(tree, each))
     program, out = jax.make_jaxpr(flat, axis_env=[(axis, parts)], return_shape=True)(*shapes)
     graph = _Graph(axis, parts)
@@ -59,7 +75,9 @@ def in_turns(function: Callable[..., Any], axis: str, arguments: tuple[Any, ...]
 
 def _spread(prefix: Any, tree: Any) -> list[bool]:
     """A boolean for every leaf of a pytree."""
-    return jax.tree.leaves(jax.tree.map(lambda one, below: jax.tree.map(lambda _: one, below), prefix, tree))
+    return jax.tree.leaves(
+        jax.tree.map(lambda one, below: jax.tree.map(lambda _: one, below), prefix, tree)
+    )
 
 
 class _Graph:
@@ -72,7 +90,9 @@ class _Graph:
         """The results of a program on these inputs; nothing is computed yet."""
         jaxpr, constants = program.jaxpr, [given_value(x, False) for x in program.consts]
         known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
-        read = lambda atom: given_value(atom.val, False) if isinstance(atom, Literal) else known[atom]
+        read = lambda atom: (
+            given_value(atom.val, False) if isinstance(atom, Literal) else known[atom]
+        )
         for equation in jaxpr.eqns:
             found = self._of(equation, [read(atom) for atom in equation.invars])
             known.update(zip(equation.outvars, found, strict=True))
@@ -80,10 +100,14 @@ class _Graph:
 
     def _of(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         name, params = equation.primitive.name, equation.params
-        level, divided = max((one.node.level for one in inputs), default=0), [one.divided for one in inputs]
+        level, divided = (
+            max((one.node.level for one in inputs), default=0),
+            [one.divided for one in inputs],
+        )
         if name in _CALLS:
             return self.built(params["jaxpr" if "jaxpr" in params else "call_jaxpr"], inputs)
-        if name == "optimization_barrier":  # a result for each input, common ones of common inputs alone
+        # a result for each input, common ones of common inputs alone
+        if name == "optimization_barrier":
             common_ones = [one for one in inputs if not one.divided]
             tied = lambda one: [one, *common_ones]
             return [Value(Node(equation, tied(one), level), 0, one.divided) for one in inputs]
@@ -107,24 +131,36 @@ class _Graph:
 
     def _divided(self, program: Any, divided: Sequence[bool]) -> list[bool]:
         """Whether each result of a program is divided, on inputs that are or are not."""
-        return [one.divided for one in self.built(program, [given_value(None, one) for one in divided])]
+        return [
+            one.divided for one in self.built(program, [given_value(None, one) for one in divided])
+        ]
 
     def results(self, values: list[Value], divided: Sequence[bool]) -> list[Any]:
         """Values, with a leading axis where they are asked for as divided."""
-        wrong = [k for k, (one, apart) in enumerate(zip(values, divided, strict=True)) if one.divided and not apart]
+        wrong = [
+            k
+            for k, (one, apart) in enumerate(zip(values, divided, strict=True))
+            if one.divided and not apart
+        ]
         if wrong:
             raise ValueError(f"results {wrong} differ between the parts")
         nodes = nodes_of(values)
         for level in range(1 + max((node.level for node in nodes), default=0)):
             after = [node for node in nodes if node.collective and node.level == level + 1]
-            store = [Value(node, 0, any(one.divided for one in node.inputs)) for node in nodes if node.is_kept]
+            store = [
+                Value(node, 0, any(one.divided for one in node.inputs))
+                for node in nodes
+                if node.is_kept
+            ]
             store = [one for one in [*store, *values] if one.node.level == level]
             for node in after:
                 store += node.inputs[_constants(node.params) :] if node.name == "while" else []
             self._pass([node for node in after if node.name in _SUMS], store)
             for node in after:
                 if node.name in ("while", "cond"):
-                    node.stored = dict(enumerate(self._loop(node) if node.name == "while" else self._branch(node)))
+                    node.stored = dict(
+                        enumerate(self._loop(node) if node.name == "while" else self._branch(node))
+                    )
         return [self._apart(one, apart) for one, apart in zip(values, divided, strict=True)]
 
     def _apart(self, value: Value, divided: bool) -> Any:
@@ -166,7 +202,10 @@ class _Graph:
         empty = [jnp.zeros((self._parts, *one.shape), one.dtype) for one in kinds]
         totals, rows = loops.fori_loop(0, self._parts, body, (least, empty))
         for node in sums:
-            node.stored, totals = dict(enumerate(totals[: len(node.inputs)])), totals[len(node.inputs) :]
+            node.stored, totals = (
+                dict(enumerate(totals[: len(node.inputs)])),
+                totals[len(node.inputs) :],
+            )
         for one, row in zip(store, rows, strict=True):
             one.node.stored = {**(one.node.stored or {}), one.index: row}
 
@@ -180,16 +219,22 @@ class _Graph:
         beside, start = node.inputs[: _constants(params)], node.inputs[_constants(params) :]
         ahead, beside = beside[: params["cond_nconsts"]], beside[params["cond_nconsts"] :]
         prepared(node.inputs)
-        state = lambda carry: [given_value(x, apart) for x, apart in zip(carry, node.divided, strict=True)]
+        state = lambda carry: [
+            given_value(x, apart) for x, apart in zip(carry, node.divided, strict=True)
+        ]
         more = lambda carry: self._run(params["cond_jaxpr"], [*ahead, *state(carry)], [False])[0]
         body = lambda carry: self._run(params["body_jaxpr"], [*beside, *state(carry)], node.divided)
-        return lax.while_loop(more, body, [self._apart(*one) for one in zip(start, node.divided, strict=True)])
+        return lax.while_loop(
+            more, body, [self._apart(*one) for one in zip(start, node.divided, strict=True)]
+        )
 
     def _branch(self, node: Node) -> list[Any]:
         """The results of the branch that is taken."""
         index, *inputs = node.inputs
         prepared(inputs)
-        branches = [lambda one=one: self._run(one, inputs, node.divided) for one in node.params["branches"]]
+        branches = [
+            lambda one=one: self._run(one, inputs, node.divided) for one in node.params["branches"]
+        ]
         return lax.switch(common(index), branches)
 
 
@@ -210,6 +255,10 @@ def _sums(equation: JaxprEqn, axis: str) -> bool:
     """Whether an equation sums over the axis, itself or in what it contains."""
     if axis in equation.params.get("axes", ()):
         return True
-    given = [x for value in equation.params.values() for x in (value if isinstance(value, (tuple, list)) else (value,))]
+    given = [
+        x
+        for value in equation.params.values()
+        for x in (value if isinstance(value, (tuple, list)) else (value,))
+    ]
     inner = [getattr(x, "jaxpr", x) for x in given]
     return any(_sums(one, axis) for x in inner if isinstance(x, Jaxpr) for one in x.eqns)

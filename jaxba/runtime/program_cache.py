@@ -1,4 +1,5 @@
-"""Where compiled programs are kept between processes: in the user's cache folder, unless something else is said."""
+"""Where compiled programs are kept between processes: in the user's cache folder, unless something
+else is said."""
 
 from __future__ import annotations
 
@@ -21,15 +22,16 @@ _is_chosen = False  # whether this process keeps programs, or was told not to
 
 
 def keep_programs(folder: str | os.PathLike[str] | None = None) -> None:
-    """Keeps compiled programs on disk, where `solve` of this process and of later ones finds them without tracing them.
+    """Keeps compiled programs on disk, where `solve` of this process and of later ones finds them
+    without tracing them.
 
-    The commands and `jaxba.bundle_adjustment` do that by themselves. Where JAX's own compilation cache is on
-    (`jax_compilation_cache_dir`), that one is used instead, and nothing changes. Programs are native code: the folder
-    must be one that nobody else writes to.
+    The commands and `jaxba.bundle_adjustment` do that by themselves. Where JAX's own compilation
+    cache is on (`jax_compilation_cache_dir`), that one is used instead, and nothing changes.
+    Programs are native code: the folder must be one that nobody else writes to.
 
     Args:
-        folder: where they are kept; `off`: nowhere. None: as the environment variable JAXBA_CACHE says, else in the
-            user's cache folder.
+        folder: where they are kept; `off`: nowhere. None: as the environment variable JAXBA_CACHE
+            says, else in the user's cache folder.
 
     A folder that cannot be written keeps nothing, and is no error."""
     global _is_chosen
@@ -49,8 +51,8 @@ def programs_are_kept() -> bool:
 
 
 def keep_programs_by_jax() -> None:
-    """Lets JAX's own cache keep the programs, which excludes `keep_programs`. It has also those that are compiled one
-    by one, but every process traces them anew."""
+    """Lets JAX's own cache keep the programs, which excludes `keep_programs`. It has also those
+    that are compiled one by one, but every process traces them anew."""
     folder = _folder(None)
     if folder is None:
         return
@@ -60,7 +62,8 @@ def keep_programs_by_jax() -> None:
 
 
 def _folder(asked: str | os.PathLike[str] | None) -> Path | None:
-    """The folder for programs of this kind of machine; None: nothing is kept, or JAX's own cache is on."""
+    """The folder for programs of this kind of machine; None: nothing is kept, or JAX's own cache is
+    on."""
     choice = os.fspath(asked) if asked is not None else os.environ.get(VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
         return None
@@ -71,13 +74,16 @@ def _folder(asked: str | os.PathLike[str] | None) -> Path | None:
 
 
 def _remove_damaged_programs(folder: Path) -> None:
-    """From now on removes cached programs that JAX cannot read: it neither replaces them nor stops to warn of them.
+    """From now on removes cached programs that JAX cannot read: it neither replaces them nor stops
+    to warn of them.
 
     A process that is killed while it writes one, or a full disk, leaves a part of it (JAX 0.12)."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, *where: Any, **named: Any) -> None:
-        damaged = re.match(r"Error reading persistent compilation cache entry for '([\w.-]+)'", str(message))
+        damaged = re.match(
+            r"Error reading persistent compilation cache entry for '([\w.-]+)'", str(message)
+        )
         if damaged is None:
             return shown(message, *where, **named)
         for entry in folder.glob(f"{damaged[1]}-*"):

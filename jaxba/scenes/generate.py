@@ -6,13 +6,21 @@ import numpy as np
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.checks import random_numbers
-from jaxba.problem.geometry import angle_axis, camera_centers, depths, project, rotation_matrices, translations
+from jaxba.problem.geometry import (
+    angle_axis,
+    camera_centers,
+    depths,
+    project,
+    rotation_matrices,
+    translations,
+)
 from jaxba.scenes.config import SceneConfig, check
 from jaxba.scenes.tracks import track_lengths
 from jaxba.scenes.trajectory import Path, make_path, true_cameras
 from jaxba.scenes.visibility import TrueCameras, Views, place_points
 
-MAX_PATHS = 8  # random paths to try. Only small scenes with many observations per point need more than one
+# random paths to try. Only small scenes with many observations per point need more than one
+MAX_PATHS = 8
 
 
 def random_scene(config: SceneConfig, seed: int | np.random.Generator) -> BundleProblem:
@@ -25,11 +33,13 @@ def random_scene_with_truth(
 ) -> tuple[BundleProblem, BundleProblem]:
     """A random scene at perturbed initial values, and the same one at the ground truth.
 
-    Both have the same noisy observations, sorted by point and camera as in BAL files, so the cost of the truth is near
-    `noise^2 * observations` where there are no outliers. Counts are exactly those of the configuration. Every point is
-    seen by two cameras or more and lies in front of and inside the image of each; every camera sees four points or more
-    where the geometry allows it. `seed` is a seed or a generator; the same seed gives the same numbers. Returns (start,
-    truth). Raises ProblemError: the options contradict each other, or the cameras overlap too little for them."""
+    Both have the same noisy observations, sorted by point and camera as in BAL files, so the cost
+    of the truth is near `noise^2 * observations` where there are no outliers. Counts are exactly
+    those of the configuration. Every point is seen by two cameras or more and lies in front of and
+    inside the image of each; every camera sees four points or more where the geometry allows it.
+    `seed` is a seed or a generator; the same seed gives the same numbers. Returns (start, truth).
+    Raises ProblemError: the options contradict each other, or the cameras overlap too little for
+    them."""
     check(config)
     rng = random_numbers(seed)
     path, truth = _path_and_truth(config, rng)
@@ -38,13 +48,16 @@ def random_scene_with_truth(
 
 
 def _path_and_truth(config: SceneConfig, rng: np.random.Generator) -> tuple[Path, BundleProblem]:
-    """Cameras and the points that they see; another path is drawn where the views of the first overlap too little."""
+    """Cameras and the points that they see; another path is drawn where the views of the first
+    overlap too little."""
     lengths = track_lengths(config.points, config.total, config.cameras)
     for attempt in range(MAX_PATHS):
         path = make_path(config, rng)
         cameras = true_cameras(config, path, rng)
         try:
-            return path, _problem(path, cameras, place_points(TrueCameras(config, path, cameras), lengths, rng))
+            return path, _problem(
+                path, cameras, place_points(TrueCameras(config, path, cameras), lengths, rng)
+            )
         except ProblemError:
             if attempt + 1 == MAX_PATHS:
                 raise
@@ -52,7 +65,8 @@ def _path_and_truth(config: SceneConfig, rng: np.random.Generator) -> tuple[Path
 
 
 def _problem(path: Path, cameras: np.ndarray, views: Views) -> BundleProblem:
-    """The truth without measurements: cameras by index, points in the order in which cameras first see them."""
+    """The truth without measurements: cameras by index, points in the order in which cameras first
+    see them."""
     points, along, point_index = views
     count = len(cameras)
     by_index = np.empty_like(cameras)
@@ -65,7 +79,9 @@ def _problem(path: Path, cameras: np.ndarray, views: Views) -> BundleProblem:
     number[order] = np.arange(len(order))
     key = np.sort(number[point_index] * np.int64(count) + camera_index)
     point_index, camera_index = np.divmod(key, count)
-    return BundleProblem.create(by_index, points[order], np.zeros((len(key), 2)), camera_index, point_index)
+    return BundleProblem.create(
+        by_index, points[order], np.zeros((len(key), 2)), camera_index, point_index
+    )
 
 
 def _measure(config: SceneConfig, truth: BundleProblem, rng: np.random.Generator) -> BundleProblem:
@@ -77,10 +93,13 @@ def _measure(config: SceneConfig, truth: BundleProblem, rng: np.random.Generator
     return truth.replace(observations=pixels)
 
 
-def _perturbed(config: SceneConfig, path: Path, truth: BundleProblem, rng: np.random.Generator) -> BundleProblem:
+def _perturbed(
+    config: SceneConfig, path: Path, truth: BundleProblem, rng: np.random.Generator
+) -> BundleProblem:
     """The truth after drift along the path and independent noise on every parameter."""
     cameras = np.array(truth.cameras)
-    tracks = np.searchsorted(truth.point_index, np.arange(truth.num_points))  # first observation of each point
+    # first observation of each point
+    tracks = np.searchsorted(truth.point_index, np.arange(truth.num_points))
     first = truth.camera_index[tracks]
     centers = camera_centers(cameras)
     moved, drift = _drift(config, path, centers, rng)
@@ -97,8 +116,11 @@ def _perturbed(config: SceneConfig, path: Path, truth: BundleProblem, rng: np.ra
 
 
 def _drift(config: SceneConfig, path: Path, centers: np.ndarray, rng: np.random.Generator) -> tuple:
-    """Centres (cameras, 3) and rotations of the world (cameras, 3, 3) after the drift of odometry."""
-    drift = rotation_matrices(np.cumsum(config.start_drift * rng.standard_normal(centers.shape), axis=0))
+    """Centres (cameras, 3) and rotations of the world (cameras, 3, 3) after the drift of
+    odometry."""
+    drift = rotation_matrices(
+        np.cumsum(config.start_drift * rng.standard_normal(centers.shape), axis=0)
+    )
     along = centers[path.index]
     steps = np.einsum("nij,nj->ni", drift[:-1], np.diff(along, axis=0))
     moved = np.empty_like(centers)

@@ -12,14 +12,23 @@ from jaxba.scenes.tracks import MIN_LENGTH
 from jaxba.scenes.trajectory import Path
 
 BUDGET = 1 << 20  # candidate views handled at once: some 100 MB of temporaries
-ATTEMPTS = 24  # to place a point where enough cameras see it, each nearer to the focus of the view than the last
-WINDOW = 2.5  # candidates per wanted view: 2, as half do not exist at an end of the path, and more for missed views
+# to place a point where enough cameras see it, each nearer to the focus of the view than the last
+ATTEMPTS = 24
+# candidates per wanted view: 2, as half do not exist at an end of the path, and more for missed
+# views
+WINDOW = 2.5
 NEAREST, FARTHEST = 0.5, 2.0  # parts of min_depth and max_depth between which a view counts
-MIN_VIEWS = 4  # every camera should see so many points: 8 residuals for its 6 degrees of freedom and focal length
+# every camera should see so many points: 8 residuals for its 6 degrees of freedom and focal length
+MIN_VIEWS = 4
 
 
-Views = tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " observations"], Int[np.ndarray, " observations"]]
-"""Points (scene units), and of each observation the camera, by its position along the path, and the point."""
+Views = tuple[
+    Float[np.ndarray, "points 3"],
+    Int[np.ndarray, " observations"],
+    Int[np.ndarray, " observations"],
+]
+"""Points (scene units), and of each observation the camera, by its position along the path, and the
+point."""
 
 
 class TrueCameras:
@@ -29,28 +38,43 @@ class TrueCameras:
         self.config, self.path, self.count = config, path, len(cameras)
         self.rotations = rotation_matrices(cameras[:, :3])
         self.translations = cameras[:, 3:6]
-        self.rows = np.ascontiguousarray(np.concatenate([self.rotations, self.translations[:, :, None]], axis=2).T)
+        self.rows = np.ascontiguousarray(
+            np.concatenate([self.rotations, self.translations[:, :, None]], axis=2).T
+        )
         self.focal, self.k1, self.k2 = np.ascontiguousarray(cameras[:, 6:].T)
         self.half = np.array([config.image_width, config.image_height]) / 2
 
-    def sample(self, reference: np.ndarray, effort: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-        """Random points in view of the reference cameras (n,); an effort near 1 keeps to the middle of the view."""
-        near, far, focus = (np.log(depth[reference]) for depth in (self.path.near, self.path.far, self.path.focus))
+    def sample(
+        self, reference: np.ndarray, effort: float, rng: np.random.Generator
+    ) -> Float[np.ndarray, "n 3"]:
+        """Random points in view of the reference cameras (n,); an effort near 1 keeps to the middle
+        of the view."""
+        near, far, focus = (
+            np.log(depth[reference]) for depth in (self.path.near, self.path.far, self.path.focus)
+        )
         depth = np.exp((1 - effort) * rng.uniform(near, far) + effort * focus)
         local = np.empty((len(reference), 3))
         plane = rng.uniform(-1, 1, (len(reference), 2)) * self.half / self.focal[reference, None]
         local[:, :2] = (1 - effort) * depth[:, None] * plane
         local[:, 2] = -depth
-        return np.einsum("nji,nj->ni", self.rotations[reference], local - self.translations[reference])
+        return np.einsum(
+            "nji,nj->ni", self.rotations[reference], local - self.translations[reference]
+        )
 
-    def sees(self, points: Float[np.ndarray, "n 3"], cameras: Int[np.ndarray, "n k"]) -> Bool[np.ndarray, "n k"]:
-        """Whether the point of each row is in front of, and in the image of, each candidate camera of the row."""
+    def sees(
+        self, points: Float[np.ndarray, "n 3"], cameras: Int[np.ndarray, "n k"]
+    ) -> Bool[np.ndarray, "n k"]:
+        """Whether the point of each row is in front of, and in the image of, each candidate camera
+        of the row."""
         x, y, z = (points[:, axis, None] for axis in range(3))
         across, upwards, behind = (
-            a[cameras] * x + b[cameras] * y + c[cameras] * z + d[cameras] for a, b, c, d in self.rows.transpose(1, 0, 2)
+            a[cameras] * x + b[cameras] * y + c[cameras] * z + d[cameras]
+            for a, b, c, d in self.rows.transpose(1, 0, 2)
         )
         depth = -behind
-        unit = self.config.step * np.array([NEAREST * self.config.min_depth, FARTHEST * self.config.max_depth])
+        unit = self.config.step * np.array(
+            [NEAREST * self.config.min_depth, FARTHEST * self.config.max_depth]
+        )
         good = (depth >= unit[0]) & (depth <= unit[1])
         inverse = 1 / np.where(good, depth, 1.0)
         px, py = across * inverse, upwards * inverse
@@ -62,12 +86,14 @@ class TrueCameras:
         return good
 
 
-def place_points(scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: np.random.Generator) -> Views:
+def place_points(
+    scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: np.random.Generator
+) -> Views:
     """Places points so that the total number of views is exactly the wanted one.
 
-    `lengths` are the wanted views of each point, longest first. A point that fewer cameras can see gets as many
-    views as there are; the rest go to points that more cameras can see. Raises ProblemError: the cameras overlap too
-    little."""
+    `lengths` are the wanted views of each point, longest first. A point that fewer cameras can see
+    gets as many views as there are; the rest go to points that more cameras can see. Raises
+    ProblemError: the cameras overlap too little."""
     count = len(lengths)
     reference = rng.permutation(np.arange(count, dtype=np.int32) % scene.count)
     points = np.empty((count, 3))
@@ -83,7 +109,8 @@ def place_points(scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: n
         start = part.stop
     if missing:
         raise ProblemError(
-            f"{missing} of {lengths.sum()} observations found no place: the cameras overlap too little "
+            f"{missing} of {lengths.sum()} observations found no place: the cameras overlap too "
+            "little "
             "(ask for fewer observations, deepen max_depth or shorten focal)"
         )
     return _rebalance(scene, points, np.concatenate(cameras), np.concatenate(owners), rng)
@@ -96,36 +123,52 @@ def _width(scene: TrueCameras, longest: int) -> int:
 
 
 def _next_part(lengths: np.ndarray, start: int, width: int) -> slice:
-    """Points from `start` on that are placed at once: within the memory budget and of similar track length."""
+    """Points from `start` on that are placed at once: within the memory budget and of similar track
+    length."""
     stop = min(start + max(BUDGET // width, 1), len(lengths))
     similar = np.searchsorted(-lengths[start:stop], -(lengths[start] // 2), side="right")
     return slice(start, start + int(similar))
 
 
-def _place(scene: TrueCameras, lengths: np.ndarray, reference: np.ndarray, rng: np.random.Generator) -> tuple:
+def _place(
+    scene: TrueCameras, lengths: np.ndarray, reference: np.ndarray, rng: np.random.Generator
+) -> tuple:
     """Points (n, 3), candidate cameras (n, k) and which of them see the point (n, k).
 
-    The best attempt of each point is kept. The second half of the attempts takes other reference cameras, since one in
-    a bend of the path may never share a point with enough others."""
+    The best attempt of each point is kept. The second half of the attempts takes other reference
+    cameras, since one in a bend of the path may never share a point with enough others."""
     count, width = len(lengths), _width(scene, int(lengths[0]))
     points, seen = np.empty((count, 3)), np.zeros(count, dtype=int)
-    candidates, visible = np.zeros((count, width), dtype=np.int32), np.zeros((count, width), dtype=bool)
+    candidates, visible = (
+        np.zeros((count, width), dtype=np.int32),
+        np.zeros((count, width), dtype=bool),
+    )
     todo = np.arange(count)
     for attempt in range(ATTEMPTS):
-        first = reference[todo] if attempt < ATTEMPTS // 2 else rng.integers(scene.count, size=todo.size)
+        first = (
+            reference[todo]
+            if attempt < ATTEMPTS // 2
+            else rng.integers(scene.count, size=todo.size)
+        )
         trial = scene.sample(first, attempt / ATTEMPTS, rng)
         cameras, inside = _window(scene, first, width, rng)
         views = scene.sees(trial, cameras) & inside
         number = views.sum(axis=1)
         better = np.flatnonzero(number > seen[todo])
         rows = todo[better]
-        points[rows], candidates[rows], visible[rows] = trial[better], cameras[better], views[better]
+        points[rows], candidates[rows], visible[rows] = (
+            trial[better],
+            cameras[better],
+            views[better],
+        )
         seen[rows] = number[better]
         todo = todo[seen[todo] < lengths[todo]]
         if not todo.size:
             break
     if seen.min() < MIN_LENGTH:
-        raise ProblemError("a camera shares no point with any other: deepen max_depth or shorten focal")
+        raise ProblemError(
+            "a camera shares no point with any other: deepen max_depth or shorten focal"
+        )
     return points, candidates, visible
 
 
@@ -134,7 +177,8 @@ def _window(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cameras around the reference, nearest first (n, width), and which of them exist.
 
-    For a share of the rows every other column is around the same position on another round of the path."""
+    For a share of the rows every other column is around the same position on another round of the
+    path."""
     column = np.arange(width)
     offset = (column + 1) // 2 * np.where(column % 2, 1, -1)
     cameras = reference[:, None] + offset.astype(np.int32)
@@ -150,8 +194,11 @@ def _window(
     return np.where(inside, cameras, 0).astype(np.int32), inside
 
 
-def _balance(wanted: np.ndarray, possible: np.ndarray, missing: int, rng: np.random.Generator) -> tuple:
-    """Numbers of views of each point, at most the possible ones, and how many are still missing from the total."""
+def _balance(
+    wanted: np.ndarray, possible: np.ndarray, missing: int, rng: np.random.Generator
+) -> tuple:
+    """Numbers of views of each point, at most the possible ones, and how many are still missing
+    from the total."""
     taken = np.minimum(wanted, possible)
     missing += int(wanted.sum() - taken.sum())
     while missing:
@@ -163,8 +210,11 @@ def _balance(wanted: np.ndarray, possible: np.ndarray, missing: int, rng: np.ran
     return taken, missing
 
 
-def _choose(visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.random.Generator) -> np.ndarray:
-    """Mask (n, k) of `taken` visible candidates of each row, nearest first, with gaps where enough are visible."""
+def _choose(
+    visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Mask (n, k) of `taken` visible candidates of each row, nearest first, with gaps where enough
+    are visible."""
     skipped = rng.random(visible.shape, dtype=np.float32) < gap_share
     skipped[:, 0] = False  # the reference camera
     first = visible & ~skipped
@@ -175,9 +225,14 @@ def _choose(visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.ra
 
 
 def _rebalance(
-    scene: TrueCameras, points: np.ndarray, owner: np.ndarray, point_index: np.ndarray, rng: np.random.Generator
+    scene: TrueCameras,
+    points: np.ndarray,
+    owner: np.ndarray,
+    point_index: np.ndarray,
+    rng: np.random.Generator,
 ) -> Views:
-    """Moves views from cameras that see most points to those that see fewer than four, where these see the point."""
+    """Moves views from cameras that see most points to those that see fewer than four, where these
+    see the point."""
     load = np.bincount(owner, minlength=scene.count)
     for poor in np.flatnonzero(load < MIN_VIEWS):
         could = scene.sees(points, np.full((len(points), 1), poor))[:, 0]

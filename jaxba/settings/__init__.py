@@ -1,6 +1,7 @@
 """Strict conversion between nested frozen dataclasses and plain data, as a YAML file holds it.
 
-Unknown keys and values of a wrong type or that the class refuses raise an error of one line with the key's path."""
+Unknown keys and values of a wrong type or that the class refuses raise an error of one line with
+the key's path."""
 
 from __future__ import annotations
 
@@ -18,19 +19,23 @@ from jaxba.settings.configurations import SettingsError
 
 Settings = TypeVar("Settings")
 
-_SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # numbers such as 3e-4, which YAML 1.1 reads as text
+# numbers such as 3e-4, which YAML 1.1 reads as text
+_SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
 _SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
 
 def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
-    """An instance of a dataclass of numbers, strings, literals, tuples, optional values and further dataclasses, from a
-    mapping by field name; missing keys have their defaults. `path` is that of the mapping inside a larger one, for
-    messages. Raises SettingsError: with the key and what it should be."""
+    """An instance of a dataclass of numbers, strings, literals, tuples, optional values and further
+    dataclasses, from a mapping by field name; missing keys have their defaults. `path` is that of
+    the mapping inside a larger one, for messages. Raises SettingsError: with the key and what it
+    should be."""
     if not isinstance(data, Mapping):
         raise SettingsError(f"{path or 'settings'} must be a mapping, is {_show(data)}")
     types_by_name = {key: _type_of(kind, key, _join(path, key)) for key in data}
-    values = {key: _value(types_by_name[key], value, _join(path, key)) for key, value in data.items()}
+    values = {
+        key: _value(types_by_name[key], value, _join(path, key)) for key, value in data.items()
+    }
     try:
         return kind(**values)
     except ValueError as error:
@@ -53,9 +58,9 @@ def to_yaml(value: Any) -> str:
 
 
 def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
-    """Sets one value, plain data, inside the nested mappings `data` of a dataclass; missing mappings are created.
-    `path` has the keys, joined by dots. Raises SettingsError: there is no such key, or the path continues below a
-    value."""
+    """Sets one value, plain data, inside the nested mappings `data` of a dataclass; missing
+    mappings are created. `path` has the keys, joined by dots. Raises SettingsError: there is no
+    such key, or the path continues below a value."""
     *above, last = path.split(".")
     for depth, key in enumerate(above, 1):
         kind, inside = _type_of(kind, key, path), ".".join(above[:depth])
@@ -73,7 +78,11 @@ def differences(one: Any, other: Any, path: str = "") -> list[str]:
     """Paths of the fields in which two settings of one class differ."""
     if dataclasses.is_dataclass(one) and type(one) is type(other):
         names = [field.name for field in dataclasses.fields(one)]
-        return [x for n in names for x in differences(getattr(one, n), getattr(other, n), _join(path, n))]
+        return [
+            x
+            for n in names
+            for x in differences(getattr(one, n), getattr(other, n), _join(path, n))
+        ]
     return [] if one == other else [path]
 
 
@@ -87,8 +96,12 @@ def _value(kind: Any, value: Any, path: str) -> Any:
     if origin is Literal:
         if value is False and "off" in inside:
             value = "off"  # YAML 1.1 reads the word as false
-        if value not in inside or isinstance(value, bool) != any(isinstance(x, bool) for x in inside):
-            raise SettingsError(f"{path} must be one of {', '.join(map(str, inside))}, is {_show(value)}")
+        if value not in inside or isinstance(value, bool) != any(
+            isinstance(x, bool) for x in inside
+        ):
+            raise SettingsError(
+                f"{path} must be one of {', '.join(map(str, inside))}, is {_show(value)}"
+            )
         return value
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
@@ -102,7 +115,9 @@ def _value(kind: Any, value: Any, path: str) -> Any:
 def _scalar(kind: Any, value: Any, path: str) -> Any:
     if (kind, type(value)) == (float, str) and _SCIENTIFIC.fullmatch(value):
         value = float(value)
-    fits = isinstance(value, (int, float) if kind is float else kind) and isinstance(value, bool) == (kind is bool)
+    fits = isinstance(value, (int, float) if kind is float else kind) and isinstance(
+        value, bool
+    ) == (kind is bool)
     if fits and (kind is not float or abs(value) < float("inf")):
         return kind(value)
     quotes = ": put it in quotes" if kind is str else ""

@@ -1,8 +1,10 @@
-"""Configuration files `configs/KIND/NAME.yaml`: how they are found by name, and how one extends another.
+"""Configuration files `configs/KIND/NAME.yaml`: how they are found by name, and how one extends
+another.
 
-An installed jaxba carries copies of them, which setup.py puts there; in a clone they lie beside the package. A file may
-begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states differences to
-its base: mappings are merged key by key, everything else, lists too, replaces what the base says."""
+An installed jaxba carries copies of them, which setup.py puts there; in a clone they lie beside the
+package. A file may begin with `extends: BASE`, the name of a configuration or a path relative to
+the file. It then states differences to its base: mappings are merged key by key, everything else,
+lists too, replaces what the base says."""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from jaxba.io.encoding import plain_text
 from jaxba.io.files import display_name, reason, visible
 from jaxba.typing import InputError
 
-Kind: TypeAlias = Literal["train", "paper", "bench"]  # command that reads a configuration, and its folder's name
+# command that reads a configuration, and its folder's name
+Kind: TypeAlias = Literal["train", "paper", "bench"]
 BASE = "extends"  # key of a file that names its base
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -30,8 +33,9 @@ def names(kind: Kind) -> list[str]:
 
 
 def find(kind: Kind, name: str, folder: Path = Path()) -> Path:
-    """Where a configuration lies: one of `names`, or the path of a file, relative to `folder`: anything with a slash or
-    an ending. Raises SettingsError: there is no such name. Whether the file of a path exists is not looked at."""
+    """Where a configuration lies: one of `names`, or the path of a file, relative to `folder`:
+    anything with a slash or an ending. Raises SettingsError: there is no such name. Whether the
+    file of a path exists is not looked at."""
     if len(Path(name).parts) != 1 or Path(name).suffix:
         return folder / name
     if name not in names(kind):
@@ -41,16 +45,18 @@ def find(kind: Kind, name: str, folder: Path = Path()) -> Path:
 
 
 def read(kind: Kind, name: str) -> dict[str, Any]:
-    """What a configuration (one of `names`, or the path of a file) says, its bases included; an empty file says
-    nothing. It is plain data, a new object with each call. Raises SettingsError: no such configuration or base, no
-    YAML, no mapping, or files that extend each other in a circle."""
+    """What a configuration (one of `names`, or the path of a file) says, its bases included; an
+    empty file says nothing. It is plain data, a new object with each call. Raises SettingsError: no
+    such configuration or base, no YAML, no mapping, or files that extend each other in a circle."""
     path = find(kind, name)
     data = read_file(path, name)
     shown, visited, layers = [name], [path.resolve()], [data]
     while BASE in data:
         base = data.pop(BASE)
         if not isinstance(base, str):
-            raise SettingsError(f"{shown[-1]}: {BASE} must be a name or the path of a file, is {base!r}")
+            raise SettingsError(
+                f"{shown[-1]}: {BASE} must be a name or the path of a file, is {base!r}"
+            )
         try:
             path = find(kind, base, path.parent)
             data = read_file(path, display_name(base))
@@ -68,8 +74,9 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
 
 
 def parse(text: str, name: str, *, as_text: bool = False) -> Any:
-    """Plain data from YAML; `name` is for messages. With `as_text` all scalars stay the text that they are, as names
-    must: `000010`, `1_000`, `yes`, `null`. Raises SettingsError: not YAML, or a mapping has a key twice."""
+    """Plain data from YAML; `name` is for messages. With `as_text` all scalars stay the text that
+    they are, as names must: `000010`, `1_000`, `yes`, `null`. Raises SettingsError: not YAML, or a
+    mapping has a key twice."""
     import yaml
 
     where = lambda mark: f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
@@ -81,11 +88,14 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
             raise SettingsError(f"{name}{where(twice.start_mark)}: {twice.value} is there twice")
         return None if node is None else loader.construct_document(node)
     except (yaml.YAMLError, RecursionError) as error:
-        raise SettingsError(f"{name}{where(getattr(error, 'problem_mark', None))}: not YAML") from None
+        raise SettingsError(
+            f"{name}{where(getattr(error, 'problem_mark', None))}: not YAML"
+        ) from None
 
 
 def _twice(root: Any) -> Any:
-    """A key that a mapping below a node of YAML has twice, so that one of its values would not count; or None."""
+    """A key that a mapping below a node of YAML has twice, so that one of its values would not
+    count; or None."""
     waiting, known = [root], set()
     while waiting:
         node = waiting.pop()
@@ -109,8 +119,8 @@ def _folder(kind: Kind) -> Path:
 
 
 def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]:
-    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`. Raises SettingsError: it cannot
-    be read, or is no mapping; `name` says which file."""
+    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`. Raises
+    SettingsError: it cannot be read, or is no mapping; `name` says which file."""
     try:
         text = plain_text(path.read_bytes()).decode()
     except UnicodeDecodeError:
@@ -129,5 +139,7 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in top.items():
         below = merged.get(key)
-        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        merged[key] = (
+            _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        )
     return merged

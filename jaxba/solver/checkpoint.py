@@ -47,19 +47,26 @@ class Saved(NamedTuple):
     """The carry; that of a file has no parameters and is a list of arrays."""
 
     def continued(self, begun: Carry) -> Carry:
-        """The carry from which the solve continues, for the one before a first iteration from the same parameters."""
+        """The carry from which the solve continues, for the one before a first iteration from the
+        same parameters."""
         rest = jax.tree.structure(begun._replace(state=None))
         found = jax.tree.unflatten(rest, [jax.numpy.asarray(leaf) for leaf in self.carry])
         return found._replace(state=begun.state, termination=begun.termination)
 
 
 class Checkpoint:
-    """A file that belongs to one problem, policy and options, whatever their limits and tolerances."""
+    """A file that belongs to one problem, policy and options, whatever their limits and
+    tolerances."""
 
     def __init__(
-        self, path: str | os.PathLike[str], problem: BundleProblem, policy: Any, options: SolveOptions
+        self,
+        path: str | os.PathLike[str],
+        problem: BundleProblem,
+        policy: Any,
+        options: SolveOptions,
     ) -> None:
-        """Raises ValueError: there are several processes. Raises ProblemError: the folder of the file is missing."""
+        """Raises ValueError: there are several processes. Raises ProblemError: the folder of the
+        file is missing."""
         if jax.process_count() > 1:
             raise ValueError("a checkpoint is of one process")
         if not os.path.isdir(os.path.dirname(os.path.abspath(path))):
@@ -68,29 +75,49 @@ class Checkpoint:
         self._path, self._last, self._labels = path, time.monotonic(), problem.labels
         self._start, self._tree = jax.tree.flatten(problem)
         losses = options.loss, *(rows.loss for rows in problem.residuals.rows)
-        own = [jax.make_jaxpr(loss.rho)(np.zeros(1, np.float32)) for loss in losses if callable(loss.rho)]
+        own = [
+            jax.make_jaxpr(loss.rho)(np.zeros(1, np.float32))
+            for loss in losses
+            if callable(loss.rho)
+        ]
         found = hashlib.blake2b(settings_text(policy, options, self._tree, own).encode())
         for leaf in self._start:
             found.update(np.ascontiguousarray(leaf).data)
         self._key = found.hexdigest()
 
     def load(self) -> Saved | None:
-        """What was saved; None if there is no file. Raises ProblemError: it is that of another solve, or no
-        checkpoint."""
+        """What was saved; None if there is no file. Raises ProblemError: it is that of another
+        solve, or no checkpoint."""
         if not os.path.exists(self._path):
             return None
         try:
             with open(self._path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
                 found = {name: file[name] for name in file.files}
             if str(found["key"]) != self._key:
-                raise ProblemError(f"{self._path} is the checkpoint of another problem, policy or options: remove it")
-            steps = [StepInfo(*(x.item() for x in row)) for row in zip(*_numbered(found, "step"), strict=True)]
+                raise ProblemError(
+                    f"{self._path} is the checkpoint of another problem, policy or options: remove "
+                    "it"
+                )
+            steps = [
+                StepInfo(*(x.item() for x in row))
+                for row in zip(*_numbered(found, "step"), strict=True)
+            ]
             there = [found.get(f"problem {k}", leaf) for k, leaf in enumerate(self._start)]
             costs = float(found["initial_cost"]), float(found["total_s"])
             problem = jax.tree.unflatten(self._tree, there).replace(labels=self._labels)
             return Saved(problem, found["away"], *costs, steps, _numbered(found, "carry"))
-        # one array is a TypeError; flipped bytes may name another compression, or say that there is a password
-        except (OSError, LookupError, ValueError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error) as error:
+        # one array is a TypeError; flipped bytes may name another compression, or say that there is
+        # a password
+        except (
+            OSError,
+            LookupError,
+            ValueError,
+            TypeError,
+            EOFError,
+            RuntimeError,
+            BadZipFile,
+            zlib.error,
+        ) as error:
             if isinstance(error, ProblemError):
                 raise
             raise ProblemError(f"{self._path} is no checkpoint: {error}") from error
@@ -101,13 +128,21 @@ class Checkpoint:
         return time.monotonic() - self._last > EVERY_S
 
     def save(self, saved: Saved) -> None:
-        """Replaces the file. Warns with a ProblemWarning if it cannot be written: the solve is worth more."""
+        """Replaces the file. Warns with a ProblemWarning if it cannot be written: the solve is
+        worth more."""
         pairs = enumerate(zip(jax.tree.leaves(saved.problem), self._start, strict=True))
-        parts: dict[str, Any] = {f"problem {k}": now for k, (now, start) in pairs if now is not start}
+        parts: dict[str, Any] = {
+            f"problem {k}": now for k, (now, start) in pairs if now is not start
+        }
         parts |= {f"step {k}": column for k, column in enumerate(zip(*saved.steps, strict=True))}
         leaves = jax.tree.leaves(saved.carry._replace(state=None))
         parts |= {f"carry {k}": leaf for k, leaf in enumerate(leaves)}
-        parts |= {"key": self._key, "away": saved.away, "initial_cost": saved.initial_cost, "total_s": saved.total_s}
+        parts |= {
+            "key": self._key,
+            "away": saved.away,
+            "initial_cost": saved.initial_cost,
+            "total_s": saved.total_s,
+        }
         try:
             with atomic_write(self._path) as file:
                 np.savez(file, **parts)
@@ -119,7 +154,8 @@ class Checkpoint:
 
 def settings_text(policy: Any, options: SolveOptions, *more: Any) -> str:
     """What determines a solve besides its problem, the same in every process."""
-    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]  # `repr` has no weights of a network
+    # `repr` has no weights of a network
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(policy)]
     # functions by what they compute: each process has them at other addresses
     return re.sub(" at 0x[0-9a-f]+", "", repr((policy, numbers, options, *more)))
 

@@ -24,14 +24,17 @@ from jaxba.structure.layout import NO_SYSTEM, Layout, build_layout
 def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any = np.float64) -> str:
     """A one-line message that names the observation for which the initial cost is not finite.
 
-    Costs and depths are those of the step's own model in the same arithmetic, so that the message cannot contradict it.
-    `loss` is that of the solve (None: squared residuals), `dtype` the type of its parameters."""
+    Costs and depths are those of the step's own model in the same arithmetic, so that the message
+    cannot contradict it. `loss` is that of the solve (None: squared residuals), `dtype` the type of
+    its parameters."""
     dtype = np.dtype(dtype)
     loss = loss or Loss()
     with numerics(dtype):
         here = placed(problem).here
         layout = build_layout(here, NO_SYSTEM)
-        found = compile_and_run(program(_start_terms, "loss", "dtype", level="quick"), layout, here, loss, dtype)
+        found = compile_and_run(
+            program(_start_terms, "loss", "dtype", level="quick"), layout, here, loss, dtype
+        )
         costs, inverse_depth = (np.asarray(x) for x in found)
     slots = np.flatnonzero(np.asarray(layout.slot_mask) & ~np.isfinite(costs))
     narrow = "" if dtype == np.float64 else f" in {dtype}; float64 has a larger range"
@@ -51,14 +54,17 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
 
 
 def cost_of_rounding(problem: BundleProblem, dtype: Any) -> float:
-    """Cost (pixels^2) of residuals that are rounding errors of their pixels alone: an exact fit has no more."""
+    """Cost (pixels^2) of residuals that are rounding errors of their pixels alone: an exact fit has
+    no more."""
     pixels = np.asarray(problem.observations, np.float64)
     if problem.whitening is not None:
         pixels = np.einsum("nij,nj->ni", np.asarray(problem.whitening, np.float64), pixels)
     return 0.5 * float(np.sum((COST_ROUNDING * float(np.finfo(dtype).eps) * pixels) ** 2))
 
 
-def _start_terms(layout: Layout, problem: BundleProblem, loss: Loss, dtype: Any) -> tuple[Array, ...]:
+def _start_terms(
+    layout: Layout, problem: BundleProblem, loss: Loss, dtype: Any
+) -> tuple[Array, ...]:
     """Cost and inverse depth of every slot at the start."""
     state = initial_state(layout, problem, StepOptions(loss=loss), dtype)
 

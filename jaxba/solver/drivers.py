@@ -1,4 +1,5 @@
-"""Who runs the iterations of a solve, and what they show of each: one compiled program, on one device or several.
+"""Who runs the iterations of a solve, and what they show of each: one compiled program, on one
+device or several.
 
 The third way, from Python, is stepwise.py."""
 
@@ -38,11 +39,12 @@ Callback = Callable[[IterationRecord], bool | None]
 """Gets the record of an iteration; a true return value ends the solve."""
 
 Watch = Callable[[IterationRecord, Callable[[], BundleProblem]], None]
-"""Gets the record of an iteration, and a function that gives the problem with the parameters after it."""
+"""Gets the record of an iteration, and a function that gives the problem with the parameters after
+it."""
 
 MIN_LENGTH = 128
-"""Smallest length of the record of a compiled loop, so that all lower limits use one program; larger limits are
-rounded up to a power of two."""
+"""Smallest length of the record of a compiled loop, so that all lower limits use one program;
+larger limits are rounded up to a power of two."""
 
 
 def record_length(max_iterations: int) -> int:
@@ -51,15 +53,16 @@ def record_length(max_iterations: int) -> int:
 
 
 class Driver:
-    """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives the state at the
-    start, and `finish`, which runs all iterations as one program, or `iterate`, which runs one, or both."""
+    """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives
+    the state at the start, and `finish`, which runs all iterations as one program, or `iterate`,
+    which runs one, or both."""
 
     carry: Carry
     """The state of the loop; from `begin`, or `finish`, on."""
 
     whole = True
-    """Whether all iterations may be one program. In that of a problem in parts an iteration takes half as long again,
-    and it compiles in twice the time."""
+    """Whether all iterations may be one program. In that of a problem in parts an iteration takes
+    half as long again, and it compiles in twice the time."""
 
     quick_iterations = 0
     """Iterations in which some program was not fully optimised."""
@@ -67,9 +70,12 @@ class Driver:
     compiling: Callable[[], AbstractContextManager] = nullcontext
     """The context in which programs compile after `begin`."""
 
-    def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
+    def __init__(
+        self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock
+    ) -> None:
         self.setup, self.tolerances, self.clock = setup, tolerances, clock
-        self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
+        # a conversion by JAX is a program
+        self.limit = np.asarray(max(1, max_iterations), np.int32)
         self.length = record_length(max_iterations)
 
     def compile_s(self) -> float:
@@ -118,10 +124,16 @@ class OnDevices(Driver):
 
     def finish(self) -> tuple[StepInfo, Termination]:
         """See `Compiled`."""
-        return self._ended(self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length))
+        return self._ended(
+            self._shards.run(
+                self.carry, self.setup.policy, self.tolerances, self.limit, self.length
+            )
+        )
 
     def iterate(self) -> tuple[StepInfo, Termination]:
         """One iteration: its record, of Python scalars, and whether it ended the solve."""
-        self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
+        self.carry, step = self._shards.run(
+            self.carry, self.setup.policy, self.tolerances, self.limit
+        )
         step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
         return step, Termination(int(self.carry.termination))

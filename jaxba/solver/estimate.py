@@ -1,4 +1,5 @@
-"""What a solve takes: memory, refused where it does not suffice, and seconds, told before a long one."""
+"""What a solve takes: memory, refused where it does not suffice, and seconds, told before a long
+one."""
 
 from __future__ import annotations
 
@@ -14,18 +15,18 @@ from jaxba.solver.choose import implicit_work, seconds, work
 from jaxba.structure.observation_order import ObservationOrder
 
 BYTES_PER_OBSERVATION = {"float64": 1100.0, "float32": 605.0}
-"""Memory of one implicit step: arguments, results and temporaries. Measured: 1,072 in float64 on a scene of the size of
-Ladybug-1197."""
+"""Memory of one implicit step: arguments, results and temporaries. Measured: 1,072 in float64 on a
+scene of the size of Ladybug-1197."""
 
 BYTES_IN_PARTS = {"float64": 420.0, "float32": 280.0}
-"""The same of a process that computes in parts (sharded.py), with the problem and what its set-up needs. Measured: 362
-on a scene of the size of Final-13682 in float64, 258 on one of 9.1 million in float32 (`python -m benchmarks.growth`).
-"""
+"""The same of a process that computes in parts (sharded.py), with the problem and what its set-up
+needs. Measured: 362 on a scene of the size of Final-13682 in float64, 258 on one of 9.1 million in
+float32 (`python -m benchmarks.growth`). """
 
 SECONDS_IN_PARTS = 2.0
-"""Seconds of an iteration in parts, relative to those of `choose.SECONDS`, which were fitted to smaller problems.
-Measured from 1 to 29 million observations: 1.5 to 2.1 with rule `ceres`, 2.5 to 4.2 with `guarded` until convergence
-(`python -m benchmarks.growth`)."""
+"""Seconds of an iteration in parts, relative to those of `choose.SECONDS`, which were fitted to
+smaller problems. Measured from 1 to 29 million observations: 1.5 to 2.1 with rule `ceres`, 2.5 to
+4.2 with `guarded` until convergence (`python -m benchmarks.growth`)."""
 
 BYTES_OF_PROGRAM = 0.7e9  # of Python, JAX and the compilation of a step
 ITERATIONS = 10  # of a solve, assumed
@@ -46,12 +47,15 @@ class Estimate(NamedTuple):
     """Bytes that there are for them; infinite if that is not known."""
 
     def check(self, dtype: str) -> None:
-        """Raises a ProblemError with the arithmetic if the memory does not suffice in this type of numbers."""
+        """Raises a ProblemError with the arithmetic if the memory does not suffice in this type of
+        numbers."""
         if self.memory[dtype] > self.available:
             double, single = (self.memory[name] / 1e9 for name in ("float64", "float32"))
             raise ProblemError(
-                f"{self.observations} observations take some {double:.1f} GB in float64 and {single:.1f} in float32, "
-                f"and there are {self.available / 1e9:.1f}: take float32 (--dtype) if that fits, more devices or "
+                f"{self.observations} observations take some {double:.1f} GB in float64 and "
+                f"{single:.1f} in float32, "
+                f"and there are {self.available / 1e9:.1f}: take float32 (--dtype) if that fits, "
+                "more devices or "
                 "processes, or fewer points"
             )
 
@@ -62,22 +66,31 @@ class Estimate(NamedTuple):
 
 
 def estimate(observations: int, *, devices: int = 1, in_parts: bool = False) -> Estimate:
-    """What so many observations take, divided among devices, each of which computes part by part or not."""
+    """What so many observations take, divided among devices, each of which computes part by part or
+    not."""
     on_gpu, each = device_memory(), BYTES_IN_PARTS if in_parts else BYTES_PER_OBSERVATION
     share = devices if np.isfinite(on_gpu) else jax.process_count()
     available = on_gpu if np.isfinite(on_gpu) else process.memory() - BYTES_OF_PROGRAM
-    return Estimate(observations, {name: size * observations / share for name, size in each.items()}, available)
+    return Estimate(
+        observations, {name: size * observations / share for name, size in each.items()}, available
+    )
 
 
 def iteration_seconds(
-    problem: BundleProblem, options: StepOptions, observations: ObservationOrder, *, in_parts: bool = False
+    problem: BundleProblem,
+    options: StepOptions,
+    observations: ObservationOrder,
+    *,
+    in_parts: bool = False,
 ) -> float:
-    """Of an iteration with these options, in parts or not, on a machine like that of `choose.SECONDS`; zero for few
-    observations, which are not worth the count of their pairs."""
+    """Of an iteration with these options, in parts or not, on a machine like that of
+    `choose.SECONDS`; zero for few observations, which are not worth the count of their pairs."""
     if len(observations.order) < ANNOUNCED:
         return 0.0
     if options.linear_solver == "implicit":
-        return (SECONDS_IN_PARTS if in_parts else 1.0) * seconds(implicit_work(len(observations.order)))
+        return (SECONDS_IN_PARTS if in_parts else 1.0) * seconds(
+            implicit_work(len(observations.order))
+        )
     amounts = work(problem, observations=observations)
     return seconds(amounts.get(options.linear_solver, amounts["implicit"]))
 

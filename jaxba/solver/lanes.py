@@ -1,9 +1,10 @@
 """Many problems of one shape as one program, each to its end.
 
-On a GPU so many at a time are *lanes*: when a problem ends, its lane takes the next one at once, so that none waits for
-the slowest (`refill`, which the game's `rollout` uses, too). On a CPU the program solves one after the other, and every
-core runs its own (many.py): that has no waiting at all, and arrays stay in the core's cache. Eight lanes side by side
-took three times as long per problem there."""
+On a GPU so many at a time are *lanes*: when a problem ends, its lane takes the next one at once, so
+that none waits for the slowest (`refill`, which the game's `rollout` uses, too). On a CPU the
+program solves one after the other, and every core runs its own (many.py): that has no waiting at
+all, and arrays stay in the core's cache. Eight lanes side by side took three times as long per
+problem there."""
 
 from __future__ import annotations
 
@@ -102,7 +103,9 @@ def solve_rows(
             put(found.iterations, carry.iteration),
             put(found.termination, carry.termination),
             jax.tree.map(
-                lambda every, own: every.at[row, carry.iteration - 1].set(own, mode="drop"), found.history, step
+                lambda every, own: every.at[row, carry.iteration - 1].set(own, mode="drop"),
+                found.history,
+                step,
             ),
         )
 
@@ -129,8 +132,8 @@ def refill(
         lanes: rows at a time.
         fresh: the state of a lane at the start of a row.
         advance: from row and state the next state, a record, and whether the row ends.
-        note: what was found, after all lanes have advanced: from what was found before, and rows, states, records and
-            ends of lanes. Rows of idle lanes are out of range.
+        note: what was found, after all lanes have advanced: from what was found before, and rows,
+            states, records and ends of lanes. Rows of idle lanes are out of range.
         found: what was found at first."""
 
     def body(loop: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -32,9 +32,9 @@ def solve_loop(
     max_iterations: int,
     limit: Int[AnyArray, ""] | None = None,
 ) -> tuple[Carry, StepInfo]:
-    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes. Returns the
-    final carry, and the record: arrays of length `max_iterations`, zero after the last iteration. Raises ValueError:
-    the state is float64, and 64 bits are not enabled in JAX.
+    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal
+    shapes. Returns the final carry, and the record: arrays of length `max_iterations`, zero after
+    the last iteration. Raises ValueError: the state is float64, and 64 bits are not enabled in JAX.
 
     Args:
         layout: the problem's observations.
@@ -59,7 +59,8 @@ def loop_from(
     length: int,
     limit: Any,
 ) -> tuple[Carry, StepInfo]:
-    """The loop from a carry to its end; the record has the given length. Other arguments as for `solve_loop`."""
+    """The loop from a carry to its end; the record has the given length. Other arguments as for
+    `solve_loop`."""
     once = lambda carry: iterate(layout, carry, policy, tolerances, options, limit)
     shapes = jax.eval_shape(once, carry)[1]
     empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
@@ -70,4 +71,6 @@ def loop_from(
         history = jax.tree.map(lambda all_, one: all_.at[before.iteration].set(one), history, step)
         return after, history
 
-    return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))
+    return lax.while_loop(
+        lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty)
+    )

@@ -1,8 +1,9 @@
 """`solve_many`: a stream of problems of any shapes, solved as few programs.
 
-Problems are padded to cells (structure/cells.py), chosen from the first ones that come. A bank holds problems of one
-cell and is solved by one call of a program (lanes.py), in a thread: as many threads as there are cores, or GPUs. What
-fits no cell, and what would not pay for compiling, is solved by `solve`."""
+Problems are padded to cells (structure/cells.py), chosen from the first ones that come. A bank
+holds problems of one cell and is solved by one call of a program (lanes.py), in a thread: as many
+threads as there are cores, or GPUs. What fits no cell, and what would not pay for compiling, is
+solved by `solve`."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ SEEN = 512  # most problems from whose sizes cells are chosen at a time
 SEEN_S = 0.5  # longest time, in seconds, that is waited for them
 
 WORTH = 16
-"""Problems of a cell that pay for compiling its program; those of a smaller cell go to a larger one, if they fit."""
+"""Problems of a cell that pay for compiling its program; those of a smaller cell go to a larger
+one, if they fit."""
 
 ENDLESS = 10_000  # problems that are expected of a stream of unknown length
 COMPILING_S = 0.1  # seconds after which a thread that waits for a program looks for other work
@@ -58,20 +60,23 @@ def solve_many(
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
 ) -> Generator[Result, None, None]:
-    """Solves any number of problems of any shapes, and gives their results in order, each as soon as it is there.
+    """Solves any number of problems of any shapes, and gives their results in order, each as soon
+    as it is there.
 
-    What a problem of the stream ends with is what `solve` alone gives, to rounding (padding changes the order of sums).
-    One that cannot be solved gives the exception that `solve` would raise, and the others go on. The first result comes
-    before any program for many is compiled; problems of sizes that are rare are solved by `solve`. An endless stream
-    runs in constant memory: at most `AHEAD` problems are read before their turn.
+    What a problem of the stream ends with is what `solve` alone gives, to rounding (padding changes
+    the order of sums). One that cannot be solved gives the exception that `solve` would raise, and
+    the others go on. The first result comes before any program for many is compiled; problems of
+    sizes that are rare are solved by `solve`. An endless stream runs in constant memory: at most
+    `AHEAD` problems are read before their turn.
 
-    Lanes are for the method `lm` with a factorisation, on one device each; with other options, and with a limit of
-    time, which is that of each problem from when its solve begins, every problem is solved by `solve`. Problems with
-    lenses, rigs or residuals share a program where they have as many cameras, and as many rows of each residual.
+    Lanes are for the method `lm` with a factorisation, on one device each; with other options, and
+    with a limit of time, which is that of each problem from when its solve begins, every problem is
+    solved by `solve`. Problems with lenses, rigs or residuals share a program where they have as
+    many cameras, and as many rows of each residual.
 
     Args:
-        problems: starts of the optimisation, read by the thread that asks for results; an exception among them, for one
-            that could not be made, is its own result.
+        problems: starts of the optimisation, read by the thread that asks for results; an exception
+            among them, for one that could not be made, is its own result.
         policy: as for `solve`.
         options: as for `solve`; they hold for all.
 
@@ -79,7 +84,10 @@ def solve_many(
         ValueError: bad options, or several processes, before the first result.
         Exception: what reading `problems` raises, after the results of those that were read."""
     if jax.distributed.is_initialized():
-        raise ValueError("solve_many is for one process: start others without connecting them, and divide the problems")
+        raise ValueError(
+            "solve_many is for one process: start others without connecting them, and divide the "
+            "problems"
+        )
     if not isinstance(problems, Iterable):
         raise ValueError(f"problems must be several, in a list or a stream, not {shown(problems)}")
     options = checked_options(options)
@@ -115,7 +123,8 @@ def _results(
 
 
 def _read(problems: Iterable[Any], failures: list[Exception]) -> Generator[Any, None, None]:
-    """The problems up to the first that cannot be read, whose exception is then among the failures."""
+    """The problems up to the first that cannot be read, whose exception is then among the
+    failures."""
     try:
         yield from problems
     except Exception as error:
@@ -154,9 +163,14 @@ class _Many:
         self._filling: dict[Sizes, list[_Job]] = {}
         self._programs: dict[Any, _Program] = {}
         self._lock = threading.Lock()
-        plain = options.linear_solver in ("auto", "explicit") and not options.step_options(policy).method
+        plain = (
+            options.linear_solver in ("auto", "explicit")
+            and not options.step_options(policy).method
+        )
         one_device = options.devices in (None, 1)
-        self._in_lanes = plain and options.max_iterations > 0 and one_device and not TimeLimit(options).exists
+        self._in_lanes = (
+            plain and options.max_iterations > 0 and one_device and not TimeLimit(options).exists
+        )
         # two solves on several devices at a time would wait for each other
         self._threads = len(self._devices) if one_device else 1
         self._pool = ThreadPoolExecutor(self._threads)
@@ -164,7 +178,8 @@ class _Many:
         self._busy = 0  # works that are pending or under way
         self._turn = itertools.count()
         self._closed = False
-        atexit.register(self.close)  # a generator that lives until then is closed when modules are gone
+        # a generator that lives until then is closed when modules are gone
+        atexit.register(self.close)
 
     def add(self, problem: Any) -> Future[Result]:
         """The result that a problem will have; perhaps that it is none."""
@@ -186,7 +201,8 @@ class _Many:
             self._begin([job], self._solve_alone)
         elif cell != NO_CELL:
             self._fill(cell, job)
-            if self._filling and self._busy < len(self._devices):  # rather than wait for a full bank
+            # rather than wait for a full bank
+            if self._filling and self._busy < len(self._devices):
                 self._submit(max(self._filling, key=lambda cell: len(self._filling[cell])))
         else:
             self._began = self._began if self._unsorted else time.monotonic()
@@ -208,7 +224,8 @@ class _Many:
             self._submit(cell)
 
     def close(self) -> None:
-        """Begins nothing more. Does not wait: it may be the garbage collector in one of the threads that calls it."""
+        """Begins nothing more. Does not wait: it may be the garbage collector in one of the threads
+        that calls it."""
         if self._closed:
             return
         self._closed = True
@@ -221,7 +238,10 @@ class _Many:
         unsorted, self._unsorted = self._unsorted, []
         if not unsorted:
             return
-        every, times = [sizes for _, sizes in unsorted], max(1.0, endless * self._expected / self._seen)
+        every, times = (
+            [sizes for _, sizes in unsorted],
+            max(1.0, endless * self._expected / self._seen),
+        )
         cells = choose_cells(every, times)
         members = Counter(cell_for(sizes, cells) for sizes in every)
         cells = [cell for cell in cells if members[cell] * times >= WORTH]
@@ -241,11 +261,13 @@ class _Many:
 
     def _submit(self, cell: Sizes) -> None:
         if bank := self._filling.pop(cell, None):
-            self._begin(bank, self._solve, cell, self._devices[next(self._turn) % len(self._devices)])
+            self._begin(
+                bank, self._solve, cell, self._devices[next(self._turn) % len(self._devices)]
+            )
 
     def _begin(self, jobs: Sequence[_Job], work: Callable[..., None], *arguments: Any) -> None:
-        """Work for a thread (`_guarded`). The pool has no more of it than threads: it does all that it has, also when
-        Python ends."""
+        """Work for a thread (`_guarded`). The pool has no more of it than threads: it does all that
+        it has, also when Python ends."""
         self._pending.append((jobs, work, arguments))
         with self._lock:
             self._busy += 1
@@ -270,7 +292,10 @@ class _Many:
     def _solve(self, bank: Sequence[_Job], cell: Sizes, device: jax.Device) -> None:
         """Solves a bank."""
         groups: dict[Any, list[tuple[Setup, _Job]]] = {}
-        with numerics(np.float32 if self._options.dtype == "float32" else np.float64), jax.default_device(device):
+        with (
+            numerics(np.float32 if self._options.dtype == "float32" else np.float64),
+            jax.default_device(device),
+        ):
             for job in bank:
                 try:
                     setup = set_up(job.problem, self._policy, self._options, capacity=cell.capacity)
@@ -284,13 +309,23 @@ class _Many:
                 if len(group) < len(bank) / 4 and key not in self._programs:  # of unusual shape
                     self._begin([job for _, job in group], self._solve_alone)
                 else:
-                    _guarded([job for _, job in group], self._solve_group, key, device, [one for one, _ in group])
+                    _guarded(
+                        [job for _, job in group],
+                        self._solve_group,
+                        key,
+                        device,
+                        [one for one, _ in group],
+                    )
 
-    def _solve_group(self, jobs: Sequence[_Job], key: Any, device: jax.Device, setups: Sequence[Setup]) -> None:
-        """Solves problems of one shape. A program is compiled by the first thread that needs it; others do what else
-        there is."""
+    def _solve_group(
+        self, jobs: Sequence[_Job], key: Any, device: jax.Device, setups: Sequence[Setup]
+    ) -> None:
+        """Solves problems of one shape. A program is compiled by the first thread that needs it;
+        others do what else there is."""
         with self._lock:
-            one = self._programs.setdefault(key, _Program("quick" if self._options.compilation == "quick" else "full"))
+            one = self._programs.setdefault(
+                key, _Program("quick" if self._options.compilation == "quick" else "full")
+            )
         if not one.ready.is_set() and not one.first.acquire(blocking=False):
             one.ready.wait(COMPILING_S)
             return self._begin(jobs, self._solve_group, key, device, setups)
@@ -302,7 +337,9 @@ class _Many:
             one.ready.set()  # if it failed, others try it themselves
         seconds = (time.perf_counter() - began) / len(setups)
         for number, (setup, job) in enumerate(zip(setups, jobs, strict=True)):
-            job.result.set_result(_solution(setup, jax.tree.map(lambda x, k=number: x[k], ends), seconds))
+            job.result.set_result(
+                _solution(setup, jax.tree.map(lambda x, k=number: x[k], ends), seconds)
+            )
         return None
 
 
@@ -322,7 +359,16 @@ class _Program:
         starts = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         limit, used = (np.asarray(n, np.int32) for n in (options.max_iterations, len(setups)))
         tolerances = options.tolerances._replace(seconds=None)
-        given = starts, one.policy, tolerances, limit, used, one.options, record_length(int(limit)), lanes
+        given = (
+            starts,
+            one.policy,
+            tolerances,
+            limit,
+            used,
+            one.options,
+            record_length(int(limit)),
+            lanes,
+        )
         return jax.tree.map(np.asarray, self._programs.run(self._function, *given))
 
 
@@ -346,6 +392,13 @@ def _solution(setup: Setup, end: Ends, seconds: float) -> Result:
         setup.check_cost(LMState(*end.state[:2], end.initial_cost))
         count = int(end.iterations)
         steps = jax.tree.map(lambda x: x[:count], end.history)
-        return solution_of(setup, end.state, float(end.initial_cost), steps, Termination(int(end.termination)), seconds)
+        return solution_of(
+            setup,
+            end.state,
+            float(end.initial_cost),
+            steps,
+            Termination(int(end.termination)),
+            seconds,
+        )
     except Exception as error:
         return error

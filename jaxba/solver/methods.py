@@ -1,9 +1,9 @@
 """The methods that compute a step, by name. Every method works with every damping policy.
 
-Plain Levenberg-Marquardt is `lm`. The others are experiments: none is imported before it is asked for by name. Another
-package can add one by an entry point of the group `jaxba.methods`: its name is that of the method, its object a class
-derived from `lm.method.StepMethod` that needs no arguments. `SolveOptions.method` also takes an object, without a name.
-"""
+Plain Levenberg-Marquardt is `lm`. The others are experiments: none is imported before it is asked
+for by name. Another package can add one by an entry point of the group `jaxba.methods`: its name is
+that of the method, its object a class derived from `lm.method.StepMethod` that needs no arguments.
+`SolveOptions.method` also takes an object, without a name."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ METHODS: Mapping[str, StepMethod] = _Methods()
 
 
 def make_method(name: str) -> StepMethod:
-    """The method called `name`, a key of `METHODS`; methods with clusters of cameras accept their largest size, as in
-    `stba:16`. Raises InputError: no such method, or an invalid size."""
+    """The method called `name`, a key of `METHODS`; methods with clusters of cameras accept their
+    largest size, as in `stba:16`. Raises InputError: no such method, or an invalid size."""
     if not isinstance(name, str):
         raise InputError(f"the name of a method must be a text, not {shown(name)}")
     if name == DEFAULT_METHOD:
@@ -72,5 +72,7 @@ def make_method(name: str) -> StepMethod:
     if method.cluster_cameras is None:
         raise InputError(f"{name!r}: {base} has no clusters whose size could be set")
     if not (size.isdecimal() and int(size) > 0):
-        raise InputError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
+        raise InputError(
+            f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}"
+        )
     return cast(StepMethod, replace(cast(Any, method), cluster_cameras=int(size)))

@@ -1,4 +1,5 @@
-"""Solver names, the same in all commands, tables and files: `[method+]policy[+refineK|+embedded][@dtype]`.
+"""Solver names, the same in all commands, tables and files:
+`[method+]policy[+refineK|+embedded][@dtype]`.
 
 Another library as a solver (a peer) is named `pyceres:MODE`."""
 
@@ -20,9 +21,11 @@ from jaxba.typing import InputError
 DTYPES = get_args(Dtype)  # known floating point types; the first is the default
 
 Repairs = Literal["none", "trials", "all"]
-"""What is done about a step that is not good enough: nothing; shorter steps; camera rounds and pattern moves, too."""
+"""What is done about a step that is not good enough: nothing; shorter steps; camera rounds and
+pattern moves, too."""
 
-INNER = "-inner"  # suffix of a peer's mode with inner iterations, the peer's own embedded iterations
+# suffix of a peer's mode with inner iterations, the peer's own embedded iterations
+INNER = "-inner"
 
 PEERS = {"pyceres": ("dense", "sparse", "iterative", f"dense{INNER}", f"sparse{INNER}")}
 """Peer libraries and their modes."""
@@ -36,8 +39,9 @@ class SolverName:
     """Name of the damping policy, see `jaxba.damping.make_policy`; empty for a peer."""
 
     refine_points: int | None = 0
-    """Number of embedded point iterations, without any other refinement. None: the step that a policy brings (a learned
-    one that of its training), or for a rule (`RULE+embedded`) all embedded iterations."""
+    """Number of embedded point iterations, without any other refinement. None: the step that a
+    policy brings (a learned one that of its training), or for a rule (`RULE+embedded`) all embedded
+    iterations."""
 
     dtype: Dtype = DTYPES[0]
     """Floating point type."""
@@ -61,7 +65,8 @@ class SolverName:
         return f"{method}{self.policy}{refinement}{dtype}"
 
     def build(self) -> tuple[DampingPolicy, SolveOptions]:
-        """The policy, and the options of the solve. Raises InputError: as `make_policy`, `make_method`."""
+        """The policy, and the options of the solve. Raises InputError: as `make_policy`,
+        `make_method`."""
         policy = make_policy(self.policy)
         step = trained_step(policy)
         if self.refine_points is not None:
@@ -69,33 +74,43 @@ class SolverName:
         elif not brings_step(self.policy):
             step = embedded().step_options(StepOptions())
         return policy, SolveOptions(
-            method=self.method, refinement=step.refinement, coordinates=step.coordinates, dtype=self.dtype
+            method=self.method,
+            refinement=step.refinement,
+            coordinates=step.coordinates,
+            dtype=self.dtype,
         )
 
 
 def adjusted(
     policy: Any, options: SolveOptions, repairs: Repairs | None, min_gain: float | None
 ) -> tuple[DampingPolicy, SolveOptions]:
-    """What `SolverName.build` returns, with other repairs and another smallest gain ratio. None: as they are. Raises
-    ValueError: `min_gain` is not in [0, 1)."""
+    """What `SolverName.build` returns, with other repairs and another smallest gain ratio. None: as
+    they are. Raises ValueError: `min_gain` is not in [0, 1)."""
     if repairs is not None:
         points = 0 if options.refinement is None else options.refinement.points
         whole = replace(EMBEDDED, points=points)
-        found = {"none": Refinement(points=points), "trials": replace(whole, camera_rounds=0, pattern_moves=0)}
+        found = {
+            "none": Refinement(points=points),
+            "trials": replace(whole, camera_rounds=0, pattern_moves=0),
+        }
         options = replace(options, refinement=found.get(repairs, whole))
     if min_gain is not None:
         if not 0 <= min_gain < 1:
             raise ValueError(f"min_gain must be at least 0 and below 1, is {min_gain}")
         agent = getattr(policy, "config", None)
-        changed = {"min_gain": min_gain} if agent is None else {"config": replace(agent, min_gain=min_gain)}
+        changed = (
+            {"min_gain": min_gain}
+            if agent is None
+            else {"config": replace(agent, min_gain=min_gain)}
+        )
         policy = replace(policy, **changed)
     return policy, options
 
 
 def split_refinement(name: str) -> tuple[str, int | None, bool]:
-    """The name of a policy without `+refineK` or `+embedded` at its end. Returns the rest of the name; the number of
-    embedded point iterations, None for the full refinement, as in `SolverName.refine_points`; and whether the name says
-    it. What it does not say is 0."""
+    """The name of a policy without `+refineK` or `+embedded` at its end. Returns the rest of the
+    name; the number of embedded point iterations, None for the full refinement, as in
+    `SolverName.refine_points`; and whether the name says it. What it does not say is 0."""
     match = _REFINEMENT.fullmatch(name)
     if match is None:
         return name, 0, False
@@ -106,30 +121,40 @@ _REFINEMENT = re.compile(r"(.*)\+(?:refine(\d+)|embedded)", re.DOTALL)
 
 
 def parse_policy(name: str) -> SolverName:
-    """The solver with plain LM in float64 of a name `policy[+refineK|+embedded]`. The policy itself is not checked."""
+    """The solver with plain LM in float64 of a name `policy[+refineK|+embedded]`. The policy itself
+    is not checked."""
     policy, refine, stated = split_refinement(name)
     return SolverName(policy, None if brings_step(policy) and not stated else refine)
 
 
 def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, SolveOptions]:
-    """The policy of a name `policy[+refineK|+embedded]`, and the options with the refinement that the name states.
-    Coordinates that the options give take precedence over those that come with `+embedded`. Raises ValueError: the
-    options have another refinement than the name. Raises InputError: as `make_policy`."""
+    """The policy of a name `policy[+refineK|+embedded]`, and the options with the refinement that
+    the name states. Coordinates that the options give take precedence over those that come with
+    `+embedded`. Raises ValueError: the options have another refinement than the name. Raises
+    InputError: as `make_policy`."""
     policy, _, stated = split_refinement(name)
     if not stated:
         return make_policy(name), options
     built, own = parse_policy(name).build()
     if options.refinement not in (None, own.refinement):
-        raise ValueError(f"policy {name!r} states its refinement: leave out that of the options, or name {policy!r}")
-    return built, replace(options, refinement=own.refinement, coordinates=options.coordinates or own.coordinates)
+        raise ValueError(
+            f"policy {name!r} states its refinement: leave out that of the options, or name "
+            f"{policy!r}"
+        )
+    return built, replace(
+        options, refinement=own.refinement, coordinates=options.coordinates or own.coordinates
+    )
 
 
 def parse_solver(name: str) -> SolverName:
-    """Parses a solver name. Raises InputError: an unknown method, mode, type or policy, or a malformed name."""
+    """Parses a solver name. Raises InputError: an unknown method, mode, type or policy, or a
+    malformed name."""
     library, _, mode = name.strip().partition(":")
     if library in PEERS:
         if mode not in PEERS[library]:
-            raise InputError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
+            raise InputError(
+                f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}"
+            )
         return SolverName("", peer=name.strip())
     # the path of a file may contain `+` and `@`
     named = re.match(rf"(.*\{SUFFIX}|{OWN})(.*)", name.strip(), re.DOTALL)
@@ -151,7 +176,9 @@ def parse_solver(name: str) -> SolverName:
             merged.append(part)
     method = merged.pop(0) if len(merged) > 1 else DEFAULT_METHOD
     if len(merged) != 1 or not merged[0]:
-        raise InputError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")
+        raise InputError(
+            f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]"
+        )
     try:
         make_method(method)
     except InputError as error:

@@ -25,7 +25,8 @@ from jaxba.solver.robust import LAST, LEAST_SCALE, RowsOfKinds, distances, robus
 NAMED = 3  # rows that a note names of more
 
 OPTIMISTIC = 5.0
-"""Factor of standard deviations up to which these are called too small, and beyond it the measurements wrong."""
+"""Factor of standard deviations up to which these are called too small, and beyond it the
+measurements wrong."""
 
 MARKS = "pixels of control points"
 """Name of the kind of pixels that were clicked."""
@@ -43,7 +44,8 @@ class Kind(NamedTuple):
     name: str
     residual: Float[np.ndarray, "rows size"]  # whitened
     row_name: Callable[[int], str]
-    off: Callable[[int, np.ndarray], str]  # how far a whitened residual of a row is in its own units; may be empty
+    # how far a whitened residual of a row is in its own units; may be empty
+    off: Callable[[int, np.ndarray], str]
     unknowns: int = 0  # numbers of the blocks that only this kind has
 
 
@@ -55,17 +57,21 @@ class Solved(NamedTuple):
     counted: Bool[np.ndarray, " observations"]  # which count in the cost
     loss: Loss
     intrinsics: Intrinsics
-    again: Callable[[BundleProblem, int], BundleProblem]  # solves a problem with a limit of iterations
+    # solves a problem with a limit of iterations
+    again: Callable[[BundleProblem, int], BundleProblem]
     noise: Noise = Noise(1.0, 1.0)  # of pixels without a stated deviation
 
 
 def notes_of(solved: Solved) -> tuple[str, ...]:
-    """A note for each kind of residuals that does not fit its standard deviations, with the rows to blame.
+    """A note for each kind of residuals that does not fit its standard deviations, with the rows to
+    blame.
 
-    Pixels count if their deviations are stated, as those of control points are. Whether anything does not fit, the
-    residuals of the solution say, or those of the pixels that took its error; what it is, another solve in which it has
-    no weight."""
-    before = {name: getattr(solved.start, name) for name in ("cameras", "points", "rigs", "residuals")}
+    Pixels count if their deviations are stated, as those of control points are. Whether anything
+    does not fit, the residuals of the solution say, or those of the pixels that took its error;
+    what it is, another solve in which it has no weight."""
+    before = {
+        name: getattr(solved.start, name) for name in ("cameras", "points", "rigs", "residuals")
+    }
     problem = solved.problem.subset(solved.counted)
     solved = solved._replace(start=problem.replace(**before), problem=problem)
     clicked = of_marks(solved.problem)
@@ -80,16 +86,22 @@ def notes_of(solved: Solved) -> tuple[str, ...]:
 
 
 def _fits_with_pixels(solved: Solved, clicked: Bool[np.ndarray, " observations"]) -> bool:
-    """Whether all rows fit in a linear model of the solution. Where pixels give way to a wrong row it has hardly a
-    residual, which is large over its own deviation. Their noise is taken to be all that the solution leaves of them."""
+    """Whether all rows fit in a linear model of the solution. Where pixels give way to a wrong row
+    it has hardly a residual, which is large over its own deviation. Their noise is taken to be all
+    that the solution leaves of them."""
     rows = tuple(replace(kind, loss=Loss()) for kind in solved.problem.residuals.rows)
     problem = solved.problem.replace(residuals=replace(solved.problem.residuals, rows=rows))
-    left, _ = left_of(problem, clicked, solved.loss, solved.intrinsics, noise_left(problem, clicked))
+    left, _ = left_of(
+        problem, clicked, solved.loss, solved.intrinsics, noise_left(problem, clicked)
+    )
     return left.all_fit(LEVEL)
 
 
-def _explained(solved: Solved, clicked: Bool[np.ndarray, " observations"], kinds: list[Kind]) -> tuple[str, ...]:
-    """Notes by the simplest explanation: a few wrong rows, else one kind, else all kinds that do not fit."""
+def _explained(
+    solved: Solved, clicked: Bool[np.ndarray, " observations"], kinds: list[Kind]
+) -> tuple[str, ...]:
+    """Notes by the simplest explanation: a few wrong rows, else one kind, else all kinds that do
+    not fit."""
     every = tuple((kind, row) for kind, of in enumerate(kinds) for row in range(len(of.residual)))
     noise = noise_of(robust_solution(solved.start, clicked, solved.again, every), clicked)
     solved = solved._replace(noise=noise)
@@ -111,7 +123,11 @@ def _explained(solved: Solved, clicked: Bool[np.ndarray, " observations"], kinds
             alone.append(_of_whole_kind(without.left, kind, kinds[kind]))
     if alone:
         return tuple(alone)
-    worse = [kind for kind in range(len(kinds)) if not robust.left.fits(kind, LEVEL / len(robust.left.kinds))]
+    worse = [
+        kind
+        for kind in range(len(kinds))
+        if not robust.left.fits(kind, LEVEL / len(robust.left.kinds))
+    ]
     return tuple(_of_whole_kind(robust.left, kind, kinds[kind]) for kind in worse)
 
 
@@ -119,12 +135,16 @@ class Linear(NamedTuple):
     """A linear model of a solve where some rows have no weight."""
 
     left: Left
-    factors: list[np.ndarray]  # by what rows of each kind are multiplied besides their standard deviations
+    # by what rows of each kind are multiplied besides their standard deviations
+    factors: list[np.ndarray]
     suspects: RowsOfKinds  # rows that seem not to fit
 
 
-def _linear(solved: Solved, clicked: Bool[np.ndarray, " observations"], dropped: RowsOfKinds = ()) -> Linear:
-    """What least squares leave where rows that do not fit, and those that are dropped, have no weight."""
+def _linear(
+    solved: Solved, clicked: Bool[np.ndarray, " observations"], dropped: RowsOfKinds = ()
+) -> Linear:
+    """What least squares leave where rows that do not fit, and those that are dropped, have no
+    weight."""
     robust = robust_solution(solved.start, clicked, solved.again, dropped)
     left, of_clicks = left_of(robust, clicked, solved.loss, solved.intrinsics, solved.noise)
     factors = [np.ones(len(kind)) for kind in left.kinds[:-1]] + [of_clicks]
@@ -142,7 +162,8 @@ def _of_few(
     linear: Linear,
     out: RowsOfKinds | None,
 ) -> tuple[str, ...]:
-    """Notes on a few rows without which all others fit, as a solve without them confirms; none if it does not."""
+    """Notes on a few rows without which all others fit, as a solve without them confirms; none if
+    it does not."""
     if not out or _scaled(linear.left, out):
         return ()
     linear = _linear(solved, clicked, out)
@@ -153,7 +174,8 @@ def _of_few(
 
 
 def _scaled(left: Left, out: RowsOfKinds) -> bool:
-    """Whether some kind has standard deviations that are all too small rather than some wrong rows."""
+    """Whether some kind has standard deviations that are all too small rather than some wrong
+    rows."""
     return any(is_scale(left, kind, out) for kind in {kind for kind, _ in out})
 
 
@@ -184,7 +206,8 @@ def _unknowns_of(problem: BundleProblem, rows: Rows) -> int:
 
 
 def _of_rows(linear: Linear, out: RowsOfKinds, kind: int, kinds: list[Kind]) -> str:
-    """That rows of a kind do not fit the rest, by how much, and which others might be wrong in their place."""
+    """That rows of a kind do not fit the rest, by how much, and which others might be wrong in
+    their place."""
     left = linear.left
     rows = [row for row in out if row[0] == kind]
     errors = {}
@@ -206,15 +229,21 @@ def _of_rows(linear: Linear, out: RowsOfKinds, kind: int, kinds: list[Kind]) -> 
 
 
 def _of_whole_kind(left: Left, kind: int, of: Kind) -> str:
-    """That all standard deviations of a kind are too small, or that the whole kind is wrong, with its largest rows."""
+    """That all standard deviations of a kind are too small, or that the whole kind is wrong, with
+    its largest rows."""
     squares, redundancy, _ = left.misfit(kind)
     factor = np.sqrt(squares / max(redundancy, LEAST_REDUNDANCY))
     sizes, _ = left.deletions(kind)
     largest = [row for row in np.argsort(-sizes, kind="stable")[:NAMED].tolist() if sizes[row] > 0]
-    named = _listed([f"{of.row_name(row)} by {np.sqrt(sizes[row]):.3g}" for row in largest], "and", len(sizes))
+    named = _listed(
+        [f"{of.row_name(row)} by {np.sqrt(sizes[row]):.3g}" for row in largest], "and", len(sizes)
+    )
     what = f"its standard deviations should be {factor:.2g} times as large"
     if factor > OPTIMISTIC:
-        what = f"by {factor:.3g} times its standard deviations: is it of other units, axes or another frame"
+        what = (
+            f"by {factor:.3g} times its standard deviations: is it of other units, axes or "
+            "another frame"
+        )
     return f"{of.name}: does not fit the rest, {what}; the largest are {named} standard deviations"
 
 
@@ -227,7 +256,8 @@ def _as_found(kind: Kind) -> str:
         name, far = kind.row_name(row), kind.off(row, kind.residual[row])
         named.append(f"{name} is {far}{sizes[row]:.3g} standard deviations off")
     return (
-        f"{kind.name}: does not fit its standard deviations, which would have to be {factor:.3g} times as large: "
+        f"{kind.name}: does not fit its standard deviations, which would have to be {factor:.3g} "
+        "times as large: "
         f"{_listed(named, 'and', len(sizes))}"
     )
 
@@ -246,10 +276,13 @@ def _listed(texts: list[str], word: str, count: int = 0) -> str:
 
 
 def _row_name(problem: BundleProblem, rows: Rows, row: int) -> str:
-    """What a note calls a row: by its images and points, and by its number where these may have several."""
+    """What a note calls a row: by its images and points, and by its number where these may have
+    several."""
     pairs = zip(rows.residual.unknowns, rows.index, strict=True)
     parts = [(name.removesuffix(SECOND), index[row]) for name, index in pairs]
-    names = dict.fromkeys(part_name(problem.labels, PARTS[name], at) for name, at in parts if name in PARTS)
+    names = dict.fromkeys(
+        part_name(problem.labels, PARTS[name], at) for name, at in parts if name in PARTS
+    )
     listed = " and ".join(names)
     if rows.residual.function.__module__.startswith("jaxba.") and listed:
         return listed

@@ -1,5 +1,5 @@
-"""From a problem to the one that is computed with, and back: without views that do not count, near the origin, and of
-frames in the place of cameras in rigs."""
+"""From a problem to the one that is computed with, and back: without views that do not count, near
+the origin, and of frames in the place of cameras in rigs."""
 
 from __future__ import annotations
 
@@ -33,16 +33,19 @@ class Placed(NamedTuple):
     """The problem without the views of images that face away (problem/facing.py), where it was."""
 
     offset: Float[np.ndarray, "3"]
-    """The middle of a scene far from the origin, scene units; zero for others. It was subtracted."""
+    """The middle of a scene far from the origin, scene units; zero for others. It was
+    subtracted."""
 
     here: BundleProblem
-    """The same problem near the origin, `in_frames` if it has rigs, `laid_out` if it has residuals of one's own."""
+    """The same problem near the origin, `in_frames` if it has rigs, `laid_out` if it has residuals
+    of one's own."""
 
     def after(
         self, layout: Layout, order: Int[AnyArray, " points"], state: LMState, options: StepOptions
     ) -> BundleProblem:
-        """The counted problem with the parameters of a state; what was not optimised is copied exactly. `layout` is
-        that of `here`, or of a shard of it; `order` has the point of the problem at each position of `state.points`."""
+        """The counted problem with the parameters of a state; what was not optimised is copied
+        exactly. `layout` is that of `here`, or of a shard of it; `order` has the point of the
+        problem at each position of `state.points`."""
         far = self.offset.any()
         problem = shift(self.counted, -self.offset) if far else self.counted
         points = np.array(problem.points, np.float64)
@@ -64,18 +67,26 @@ class Placed(NamedTuple):
         if options.intrinsics == "fixed":
             cameras[:, 6:] = problem.cameras[:, 6:]
         elif lenses is not None:
-            cameras[:, 6:] = np.where(np.asarray(lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
+            cameras[:, 6:] = np.where(
+                np.asarray(lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:]
+            )
         if rigs is not None:
             cameras = with_unseen_of_frames(rigs, cameras, seen)
         order = np.asarray(order)
         real = order < len(points)
         points[order[real]] = np.asarray(state.points, np.float64).T[real]
-        found, constants = problem.replace(cameras=cameras, points=points, rigs=rigs), problem.constants
+        found, constants = (
+            problem.replace(cameras=cameras, points=points, rigs=rigs),
+            problem.constants,
+        )
         if constants is None:
             return (shift(found, self.offset) if far else found).replace(residuals=residuals)
         poses = np.asarray(constants.poses)
-        found = shift(_with_constants(found, problem, constants, poses), self.offset).replace(residuals=residuals)
-        # bit for bit: parts of a translation are constant only where the rotation is, else those of the shifted scene
+        found = shift(_with_constants(found, problem, constants, poses), self.offset).replace(
+            residuals=residuals
+        )
+        # bit for bit: parts of a translation are constant only where the rotation is, else those of
+        # the shifted scene
         return _with_constants(found, self.counted, constants, poses & poses[:, :1])
 
 
@@ -87,9 +98,10 @@ def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NO_CAMERAS) 
 
 
 def check_problem(problem: BundleProblem) -> None:
-    """First of all in every public function of a problem that computes with JAX. Raises ValueError: it is no problem.
-    Raises TypeError: JAX traces it. Raises ProblemError: it has neither observations nor other residuals. Raises
-    RuntimeError: the process was forked from one in which JAX had started."""
+    """First of all in every public function of a problem that computes with JAX. Raises ValueError:
+    it is no problem. Raises TypeError: JAX traces it. Raises ProblemError: it has neither
+    observations nor other residuals. Raises RuntimeError: the process was forked from one in which
+    JAX had started."""
     check_is_problem(problem)
     if not problem.num_observations and not problem.residuals:
         raise ProblemError("the problem has no observations")

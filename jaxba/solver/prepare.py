@@ -1,4 +1,5 @@
-"""Preparation of a solve: place the problem, choose the solver, lay out the observations; and back to a problem."""
+"""Preparation of a solve: place the problem, choose the solver, lay out the observations; and back
+to a problem."""
 
 from __future__ import annotations
 
@@ -37,8 +38,8 @@ from jaxba.typing import AnyArray, ArrayRecord
 DEFAULT_POLICY = GUARDED  # name of the default damping policy
 
 PADDED_CAMERAS, PADDED_OBSERVATIONS = 64, 60_000
-"""Largest problem that is padded by default. Measured: iterations take 1.1 to 1.4 times as long up to there, but twice
-with 2,000 observations; with 77 cameras 1.2 to 1.5 times."""
+"""Largest problem that is padded by default. Measured: iterations take 1.1 to 1.4 times as long up
+to there, but twice with 2,000 observations; with 77 cameras 1.2 to 1.5 times."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,13 +85,16 @@ class Setup(ArrayRecord):
         return call(initial, self.layout, *self.start, self.options, self.dtype)
 
     def check_cost(self, state: LMState) -> None:
-        """Raises a ProblemError that names an observation if the cost of the initial state is not finite."""
+        """Raises a ProblemError that names an observation if the cost of the initial state is not
+        finite."""
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(self.problem, self.options.loss, self.dtype))
 
     def problem_at(self, state: LMState) -> BundleProblem:
-        """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
-        points = np.moveaxis(distributed.to_host(state.points), -2, 0).reshape(3, -1)  # of several shards
+        """The problem with the parameters of a state, as NumPy float64; what is not optimised is
+        copied exactly."""
+        # of several shards
+        points = np.moveaxis(distributed.to_host(state.points), -2, 0).reshape(3, -1)
         order = self.layout.points if self.shards is None else self.shards.order
         found = self.placed.after(self.layout, order, state._replace(points=points), self.options)
         if not len(self.away):
@@ -111,13 +115,17 @@ class Prepared(Setup):
 
 
 def prepare(
-    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
+    problem: BundleProblem,
+    policy: str | DampingPolicy = DEFAULT_POLICY,
+    options: SolveOptions | None = None,
 ) -> Prepared:
-    """Everything that a solve does before its first iteration, for callers that jit, vmap or time the loop themselves.
+    """Everything that a solve does before its first iteration, for callers that jit, vmap or time
+    the loop themselves.
 
     Arrays are float64 unless the options say float32. To use them, enable 64 bits in JAX with
-    `jax.config.update("jax_enable_x64", True)` or `jax.enable_x64(True)`. The problem is the start of the optimisation;
-    `policy` and `options` are as for `solve`. Raises ValueError, ProblemError: as `solve`."""
+    `jax.config.update("jax_enable_x64", True)` or `jax.enable_x64(True)`. The problem is the start
+    of the optimisation; `policy` and `options` are as for `solve`. Raises ValueError, ProblemError:
+    as `solve`."""
     setup = set_up(problem, policy, options)
     if setup.shards is not None:
         raise ProblemError("prepare is for one device; jaxba.solve divides a problem among several")
@@ -139,9 +147,10 @@ def set_up(
 ) -> Setup:
     """`prepare` without the initial state. Arguments and errors as there.
 
-    `away`: whose views are left out, if that is decided. `capacity`: to which sizes it is padded, if that is decided;
-    the layout then stays on the host. `in_parts`: whether a device may compute a large problem part by part. `tell`
-    is called with what a long solve takes, before it is laid out."""
+    `away`: whose views are left out, if that is decided. `capacity`: to which sizes it is padded,
+    if that is decided;
+    the layout then stays on the host. `in_parts`: whether a device may compute a large problem part
+    by part. `tell` is called with what a long solve takes, before it is laid out."""
     check_problem(problem)
     options = checked_options(options)
     if isinstance(policy, str):
@@ -166,28 +175,41 @@ def set_up(
         may_pad = len(devices) == 1 and not step.method and asked in ("auto", "explicit")
         if may_pad and not given and _pads(observations, options):
             capacity = capacity_of(here, observations)
-        if capacity:  # `auto` depends on exact sizes, so that problems of one capacity might get different programs; up
+        # `auto` depends on exact sizes, so that problems of one capacity might get different
+        # programs; up
+        if capacity:
             asked = "explicit"  # to the largest capacity it is never slow
         step = choose_linear_solver(here, step, asked, observations)
         parts = num_parts(here, step, len(devices)) if in_parts else 1
         needs = estimate(len(observations.order), devices=len(devices), in_parts=parts > 1)
         needs.check(dtype.name)
-        if tell and is_long(iteration_s := iteration_seconds(here, step, observations, in_parts=parts > 1)):
+        if tell and is_long(
+            iteration_s := iteration_seconds(here, step, observations, in_parts=parts > 1)
+        ):
             tell(needs.told(dtype.name, iteration_s))
         shards = None if len(devices) * parts == 1 else Shards(here, step, devices, dtype, parts)
         if parts > 1:
             process.return_memory()
         grid = capacity is None  # else a shape would depend on more than the capacity
-        layout = shards.first if shards else build_layout(here, step, capacity, observations, grid=grid)
+        layout = (
+            shards.first if shards else build_layout(here, step, capacity, observations, grid=grid)
+        )
         layout = layout if shards or given else jax.device_put(layout)
-        start = (here.cameras, here.points) if capacity is None else padded_parameters(here, capacity)
+        start = (
+            (here.cameras, here.points) if capacity is None else padded_parameters(here, capacity)
+        )
         setup_s = time.perf_counter() - started
-    return Setup(problem, away, found, layout, step, policy, capacity, start, dtype, setup_s, shards)
+    return Setup(
+        problem, away, found, layout, step, policy, capacity, start, dtype, setup_s, shards
+    )
 
 
 def _pads(observations: ObservationOrder, options: SolveOptions) -> bool:
     """Whether sizes are to be padded, if they can be."""
     if options.pad is not None:
         return options.pad
-    small = observations.num_cameras <= PADDED_CAMERAS and len(observations.order) <= PADDED_OBSERVATIONS
+    small = (
+        observations.num_cameras <= PADDED_CAMERAS
+        and len(observations.order) <= PADDED_OBSERVATIONS
+    )
     return small and options.compilation != "full"

@@ -1,4 +1,5 @@
-"""Programs compiled before they are wanted: those of problems that are given, or of usual kinds and sizes."""
+"""Programs compiled before they are wanted: those of problems that are given, or of usual kinds and
+sizes."""
 
 from __future__ import annotations
 
@@ -30,17 +31,22 @@ SIZES = (
     *((48, slots) for slots in (32768, 40960)),
     *((64, slots) for slots in (40960, 49152)),
 )
-"""Cameras and slots of the grid (structure/padding.py) of problems with 250 to 1,000 observations a camera."""
+"""Cameras and slots of the grid (structure/padding.py) of problems with 250 to 1,000 observations a
+camera."""
 
-FEWEST = SIZES[0][0]  # cameras up to which a mapper adjusts all of them by its loss for local adjustments
+# cameras up to which a mapper adjusts all of them by its loss for local adjustments
+FEWEST = SIZES[0][0]
 
 LOCAL_SIZES = tuple((cameras, slots) for cameras in (8, 16, 32) for slots in (6144, 8192, 12288))
-"""Those of the local adjustments of COLMAP's mapper: six free images, and all others that see their points."""
+"""Those of the local adjustments of COLMAP's mapper: six free images, and all others that see their
+points."""
 
-FILLED = 0.84  # observations of a scene for each slot of its size; others are half of a chunk, or empty
+# observations of a scene for each slot of its size; others are half of a chunk, or empty
+FILLED = 0.84
 TRACK = 4.3  # observations of a point, as in BAL's problems and in those of COLMAP on KITTI
 FREE = 6  # images that a local adjustment of COLMAP optimises
-KEPT_SHARE = 0.2  # of Linux's limit of mappings, up to which compiled programs stay: gigabytes are not needed
+# of Linux's limit of mappings, up to which compiled programs stay: gigabytes are not needed
+KEPT_SHARE = 0.2
 MAPPER_LOSS = Loss("soft_l1", 1.0)  # of COLMAP's mapper in the first adjustments after each image
 
 
@@ -60,14 +66,17 @@ def prepare_programs(
 ) -> int:
     """Compiles programs fully, and keeps them on disk, so that no later solve waits for them.
 
-    Programs belong to a kind of problem (lenses, loss, policy) and to sizes on a coarse grid (`SolveOptions.pad`).
+    Programs belong to a kind of problem (lenses, loss, policy) and to sizes on a coarse grid
+    (`SolveOptions.pad`).
 
     Args:
-        problems: those for whose kinds and sizes programs are compiled. None: usual ones, of up to 64 cameras: with own
-            lenses as in BAL's files, with one lens as in most of COLMAP's models, and those of COLMAP's mapper.
+        problems: those for whose kinds and sizes programs are compiled. None: usual ones, of up to
+            64 cameras: with own lenses as in BAL's files, with one lens as in most of COLMAP's
+            models, and those of COLMAP's mapper.
         policy: as for `solve`.
         options: as for `solve`. Their loss is not that of the usual problems, which have their own.
-        progress: called with the number of kinds that are done, and that of all, before the first and after each.
+        progress: called with the number of kinds that are done, and that of all, before the first
+            and after each.
 
     Returns:
         The number of kinds.
@@ -77,9 +86,15 @@ def prepare_programs(
         ProblemError: as `solve`."""
     keep_programs_by_default()
     if not programs_are_kept():
-        raise ValueError("no programs are kept on disk here: see jaxba.keep_programs and JAXBA_CACHE")
+        raise ValueError(
+            "no programs are kept on disk here: see jaxba.keep_programs and JAXBA_CACHE"
+        )
     chosen = checked_options(options)
-    kinds = list(usual_kinds()) if problems is None else [Kind(problem, chosen.loss) for problem in problems]
+    kinds = (
+        list(usual_kinds())
+        if problems is None
+        else [Kind(problem, chosen.loss) for problem in problems]
+    )
     for number, kind in enumerate(kinds):
         if progress:
             progress(number, len(kinds))
@@ -127,12 +142,14 @@ def _local(problem: BundleProblem) -> BundleProblem:
 
 
 def _seen_twice(problem: BundleProblem) -> BundleProblem:
-    """The problem with a view of a point that is there twice, as most of COLMAP's models have some."""
+    """The problem with a view of a point that is there twice, as most of COLMAP's models have
+    some."""
     return problem.subset(np.append(0, np.arange(problem.num_observations)))
 
 
 def _with_one_lens(problem: BundleProblem) -> BundleProblem:
-    """The problem with one lens of COLMAP's SIMPLE_RADIAL, and two poses constant in part, as COLMAP's gauge has it."""
+    """The problem with one lens of COLMAP's SIMPLE_RADIAL, and two poses constant in part, as
+    COLMAP's gauge has it."""
     free = np.zeros((1, LENS_SIZE), bool)
     free[0, :2] = True  # focal length and one coefficient of distortion
     lens = Lenses(np.zeros(problem.num_cameras, np.int32), free)

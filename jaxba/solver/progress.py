@@ -1,4 +1,5 @@
-"""What a solve prints while it runs: that it compiles, and a table of the iterations like that of Ceres."""
+"""What a solve prints while it runs: that it compiles, and a table of the iterations like that of
+Ceres."""
 
 from __future__ import annotations
 
@@ -10,7 +11,10 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 
 from jaxba.solver.drivers import Callback, IterationRecord
 
-COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
+COLUMNS = (
+    "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  "
+    "iter_time  total_time"
+)
 LONG_ITERATION_S = 5.0  # of an iteration whose seconds are counted while it runs
 BEAT_S = 0.5  # compilation is announced after so long, and has a dot for each of these
 
@@ -37,8 +41,8 @@ SILENT = Waiting()
 
 
 class Printed(Waiting):
-    """A line of what a long solve takes, one that grows while programs compile and, on a terminal, one that counts the
-    seconds of a long iteration beside those of the last one."""
+    """A line of what a long solve takes, one that grows while programs compile and, on a terminal,
+    one that counts the seconds of a long iteration beside those of the last one."""
 
     def __init__(self) -> None:
         self._last_s = 0.0
@@ -65,7 +69,9 @@ class Printed(Waiting):
 
         def show(_: int) -> str:
             seconds = time.perf_counter() - began
-            return f"\r{iteration:4d}  {seconds:.0f} s{of_last} " if seconds > LONG_ITERATION_S else ""
+            return (
+                f"\r{iteration:4d}  {seconds:.0f} s{of_last} " if seconds > LONG_ITERATION_S else ""
+            )
 
         shown = _beating(show, end=lambda beats: "\r\033[K" if beats else "")
         with shown if sys.stdout.isatty() else nullcontext():
@@ -74,7 +80,8 @@ class Printed(Waiting):
 
 
 def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Waiting]:
-    """A callback that prints a row and calls the one that is given, and what is printed of things that take time."""
+    """A callback that prints a row and calls the one that is given, and what is printed of things
+    that take time."""
     if not verbose:
         return callback, SILENT
     printed, begun = Printed(), False
@@ -82,7 +89,9 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Wa
     def show(record: IterationRecord) -> bool | None:
         nonlocal begun
         if not begun:
-            print(f"{COLUMNS}\n{record.iteration - 1:4d}  {record.step.previous_cost:.6e}", flush=True)
+            print(
+                f"{COLUMNS}\n{record.iteration - 1:4d}  {record.step.previous_cost:.6e}", flush=True
+            )
         print(row(record, printed.time_s), flush=True)
         begun, printed.time_s = True, record.time_s
         return callback and callback(record)
@@ -91,11 +100,14 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Wa
 
 
 def row(record: IterationRecord, time_before: float) -> str:
-    """The row of an iteration, with the accepted cost, and the change of the cost by the candidate."""
+    """The row of an iteration, with the accepted cost, and the change of the cost by the
+    candidate."""
     step = record.step
     cells = (
-        f"{record.iteration:4d}  {step.cost:.6e}  {step.previous_cost - step.candidate_cost: .2e}   "
-        f"{step.gradient_max:.2e}   {step.step_norm:.2e}  {step.gain_ratio: .2e}  {step.damping:.2e}  "
+        f"{record.iteration:4d}  {step.cost:.6e}  {step.previous_cost - step.candidate_cost: .2e} "
+        "  "
+        f"{step.gradient_max:.2e}   {step.step_norm:.2e}  {step.gain_ratio: .2e}  "
+        f"{step.damping:.2e}  "
         f"{step.cg_iterations:7d}   {record.time_s - time_before:.2e}   {record.time_s:.2e}"
     )
     return cells if step.accepted else f"{cells}  rejected"
@@ -103,13 +115,15 @@ def row(record: IterationRecord, time_before: float) -> str:
 
 def _compiling() -> AbstractContextManager:
     """Prints a line that grows while what is inside takes its time."""
-    return _beating(lambda beat: "." if beat else "compiling ", end=lambda beats: "\n" * (beats > 0))
+    return _beating(
+        lambda beat: "." if beat else "compiling ", end=lambda beats: "\n" * (beats > 0)
+    )
 
 
 @contextmanager
 def _beating(show: Callable[[int], str], end: Callable[[int], str]) -> Iterator[None]:
-    """Prints what `show` gives for the number of each beat while what is inside takes its time, then the end for how
-    many gave something."""
+    """Prints what `show` gives for the number of each beat while what is inside takes its time,
+    then the end for how many gave something."""
     done = threading.Event()
 
     def beat() -> None:

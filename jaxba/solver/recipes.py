@@ -1,7 +1,7 @@
 """Recipes: policies that often end in different minima. Side by side, the lowest end wins.
 
-Which ones, and in which order, is measured on windows of real problems (`python -m benchmarks.recipes`): each is the
-one that adds most to those before it."""
+Which ones, and in which order, is measured on windows of real problems (`python -m
+benchmarks.recipes`): each is the one that adds most to those before it."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ def solve_recipes(
     Args:
         problem: the start of all solves.
         count: number of policies, from 1 to that of `RECIPES`.
-        policy: the first policy; the others are the next ones of `RECIPES`, which bring their own refinement and
-            coordinates.
-        options: as for `solve`. A limit of time (`Tolerances.seconds`) is that of all solves together.
+        policy: the first policy; the others are the next ones of `RECIPES`, which bring their own
+            refinement and coordinates.
+        options: as for `solve`. A limit of time (`Tolerances.seconds`) is that of all solves
+            together.
 
     Returns:
         All solutions; `min(solutions, key=lambda solution: solution.final_cost)` is the best.

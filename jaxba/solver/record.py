@@ -1,7 +1,8 @@
 """The record of a solve: what `jaxba-solve --log` writes, and a line of `results.jsonl`.
 
-`io/json_lines.py` writes it. The keys are the field names below, except that `TracePoint.damping` is written as
-`"lambda"`, a reserved word in Python. They must not change, since other tools and old result files rely on them."""
+`io/json_lines.py` writes it. The keys are the field names below, except that `TracePoint.damping`
+is written as `"lambda"`, a reserved word in Python. They must not change, since other tools and old
+result files rely on them."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ class TracePoint:
     """Seconds since the start of the solve, without compilation."""
 
     cost: float
-    """Accepted cost after this iteration, `1/2 sum rho` in pixels squared; unchanged by a rejected step."""
+    """Accepted cost after this iteration, `1/2 sum rho` in pixels squared; unchanged by a rejected
+    step."""
 
     damping: float = field(metadata={"key": "lambda"})
     """Lambda of this iteration, dimensionless; written as `"lambda"`. NaN where unknown."""
@@ -42,7 +44,8 @@ class TracePoint:
     """Conjugate gradient iterations of this linear solve; 0 for a direct solver."""
 
     gain_ratio: float
-    """Actual over predicted decrease of the cost. NaN where there was no step, e.g. after a failed factorisation."""
+    """Actual over predicted decrease of the cost. NaN where there was no step, e.g. after a failed
+    factorisation."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ class Record:
     """Number of observations."""
 
     solver: str
-    """Name, `[method+]policy[+refineK|+embedded][@dtype]`, or that of another library, e.g. `pyceres:dense`."""
+    """Name, `[method+]policy[+refineK|+embedded][@dtype]`, or that of another library, e.g.
+    `pyceres:dense`."""
 
     backend: str
     """Library that ran, with its version and linear solver."""
@@ -107,7 +111,8 @@ class Record:
     """Conjugate gradient iterations, summed over the linear solves."""
 
     termination: str
-    """Why the solve stopped; `jaxba.bench.profile.CONVERGED` lists the reasons that count as converged."""
+    """Why the solve stopped; `jaxba.bench.profile.CONVERGED` lists the reasons that count as
+    converged."""
 
     trace: tuple[TracePoint, ...]
     """The start and every iteration."""
@@ -117,13 +122,25 @@ class Record:
 
 
 def record_of(
-    solution: Solution, steps: Sequence[IterationRecord], *, name: str, family: str, solver: SolverName, repeat: int = 0
+    solution: Solution,
+    steps: Sequence[IterationRecord],
+    *,
+    name: str,
+    family: str,
+    solver: SolverName,
+    repeat: int = 0,
 ) -> Record:
     """The record of a solution and its iterations."""
     start = TracePoint(0, 0.0, solution.initial_cost, math.nan, True, 0, math.nan)
     names = [one.name for one in fields(TracePoint)[2:]]
     values = [[np.asarray(getattr(item.step, name)).item() for name in names] for item in steps]
-    trace = [start, *(TracePoint(item.iteration, item.time_s, *x) for item, x in zip(steps, values, strict=True))]
+    trace = [
+        start,
+        *(
+            TracePoint(item.iteration, item.time_s, *x)
+            for item, x in zip(steps, values, strict=True)
+        ),
+    ]
     device = jax.devices()[0]
     return Record(
         problem=name,

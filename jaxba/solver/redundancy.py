@@ -1,14 +1,16 @@
-"""What least squares leave of the rows that are tested, and its covariance: `Q v` and Q (solver/fit.py) of these rows.
+"""What least squares leave of the rows that are tested, and its covariance: `Q v` and Q
+(solver/fit.py) of these rows.
 
-With the Jacobians A and P of all residuals v by cameras and points, A' and P' of the tested ones among them, and, as in
-results/covariance.py, `B = A^T A`, `E = A^T P`, `C = P^T P`, `S = B - E C^-1 E^T`,
+With the Jacobians A and P of all residuals v by cameras and points, A' and P' of the tested ones
+among them, and, as in results/covariance.py, `B = A^T A`, `E = A^T P`, `C = P^T P`, `S = B - E C^-1
+E^T`,
 
     F = A' - P' C^-1 E^T
     Q = I - P' C^-1 P'^T - F S^-1 F^T
     Q v = v' - P' C^-1 P^T v - F S^-1 (A^T v - E C^-1 P^T v).
 
-Pixels of other points have no stated standard deviation. Theirs is estimated: the median of their residuals, over that
-of normals."""
+Pixels of other points have no stated standard deviation. Theirs is estimated: the median of their
+residuals, over that of normals."""
 
 from __future__ import annotations
 
@@ -32,10 +34,12 @@ from jaxba.solver.place import placed
 from jaxba.structure.layout import build_layout
 
 NORMAL = 1.4826  # standard deviation over the median absolute value of normals
-LEAST_PIXELS = 0.01  # least standard deviation of pixels, which keeps those of scenes without noise in bounds
+# least standard deviation of pixels, which keeps those of scenes without noise in bounds
+LEAST_PIXELS = 0.01
 
 MOST_UNKNOWNS, MOST_NUMBERS = 3000, 3000
-"""Most unknown numbers of cameras, and numbers of tested rows, whose matrices are dense: ten seconds on two cores."""
+"""Most unknown numbers of cameras, and numbers of tested rows, whose matrices are dense: ten
+seconds on two cores."""
 
 
 class TooLargeError(Exception):
@@ -44,12 +48,17 @@ class TooLargeError(Exception):
 
 @numerics(np.float64, single_blas=False)
 def left_of(
-    problem: BundleProblem, clicked: Bool[np.ndarray, " observations"], loss: Loss, intrinsics: Intrinsics, noise: Noise
+    problem: BundleProblem,
+    clicked: Bool[np.ndarray, " observations"],
+    loss: Loss,
+    intrinsics: Intrinsics,
+    noise: Noise,
 ) -> tuple[Left, Float[np.ndarray, " clicked"]]:
-    """What least squares leave of all rows of residuals, and of clicked pixels as the last kind, in a linear model.
+    """What least squares leave of all rows of residuals, and of clicked pixels as the last kind, in
+    a linear model.
 
-    Clicks are no more accurate than other pixels turn out to be. The second result is their stated deviation over the
-    one that they get.
+    Clicks are no more accurate than other pixels turn out to be. The second result is their stated
+    deviation over the one that they get.
 
     Args:
         problem: with squared losses of its rows, near its minimum.
@@ -61,7 +70,11 @@ def left_of(
     Raises TooLargeError: see `MOST_UNKNOWNS`."""
     from scipy.sparse import csr_matrix
 
-    options = StepOptions(linear_solver="implicit", intrinsics=intrinsics, coordinates=Coordinates(rotation="manifold"))
+    options = StepOptions(
+        linear_solver="implicit",
+        intrinsics=intrinsics,
+        coordinates=Coordinates(rotation="manifold"),
+    )
     here = placed(problem).here
     layout = build_layout(here, options)
     index, count = unknown_index(here, layout)
@@ -71,7 +84,9 @@ def left_of(
     free_points = np.ones(here.num_points, bool)
     if here.constants:
         free_points &= ~np.asarray(here.constants.points)
-    linear = jax.device_get(compile_and_run(program(linear_at, "options", level="quick"), layout, here, options))
+    linear = jax.device_get(
+        compile_and_run(program(linear_at, "options", level="quick"), layout, here, options)
+    )
     weights = np.ones(here.num_observations + 1)
     weights[: problem.num_observations] = _weights(problem, clicked, loss, noise)
     of_clicks = weights[: problem.num_observations][clicked]
@@ -101,7 +116,9 @@ def left_of(
         kinds.append(place_of_number)
         start += place_of_number.size
     shape = numbers, len(system.residual)
-    chosen = csr_matrix((np.concatenate(factors), (np.concatenate(entries), np.concatenate(columns))), shape)
+    chosen = csr_matrix(
+        (np.concatenate(factors), (np.concatenate(entries), np.concatenate(columns))), shape
+    )
     by_camera, by_point = chosen @ system.jacobian, chosen @ system.by_point
     blocks = point_blocks(system)
     cross = system.jacobian.T @ system.by_point
@@ -122,20 +139,31 @@ class Noise(NamedTuple):
 
 
 def noise_of(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -> Noise:
-    """The noise of the other pixels where nothing else pulls; one where they are too few to tell it."""
+    """The noise of the other pixels where nothing else pulls; one where they are too few to tell
+    it."""
     spare = 2 * np.sum(~clicked) - num_unknowns(problem)
     if spare <= 0:
         return Noise(1.0, 1.0)
     lost = NORMAL * np.sqrt(2 * np.sum(~clicked) / spare)
-    left = geometry.residuals(problem)[~clicked], (problem.observations - geometry.project(problem))[~clicked]
-    return Noise(*(max(LEAST_PIXELS, lost * float(np.median(np.abs(residual)))) for residual in left))
+    left = (
+        geometry.residuals(problem)[~clicked],
+        (problem.observations - geometry.project(problem))[~clicked],
+    )
+    return Noise(
+        *(max(LEAST_PIXELS, lost * float(np.median(np.abs(residual)))) for residual in left)
+    )
 
 
 def noise_left(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -> Noise:
     """The root mean square of what a solution leaves of the other pixels, per degree of freedom."""
     spare = max(2 * np.sum(~clicked) - num_unknowns(problem), 1)
-    left = geometry.residuals(problem)[~clicked], (problem.observations - geometry.project(problem))[~clicked]
-    return Noise(*(max(LEAST_PIXELS, float(np.sqrt(np.sum(residual**2) / spare))) for residual in left))
+    left = (
+        geometry.residuals(problem)[~clicked],
+        (problem.observations - geometry.project(problem))[~clicked],
+    )
+    return Noise(
+        *(max(LEAST_PIXELS, float(np.sqrt(np.sum(residual**2) / spare))) for residual in left)
+    )
 
 
 def _weights(
@@ -153,7 +181,8 @@ def _weights(
 def _rows_among(
     place: Int[np.ndarray, "rows pairs ends"], size: int
 ) -> tuple[Int[np.ndarray, "rows size ends"], float]:
-    """Where the numbers of rows are among those of observations, and by what the sum over ends is multiplied: of a row
-    of two cameras or points each end has its residual over the root of two (structure/residual_slots.py)."""
+    """Where the numbers of rows are among those of observations, and by what the sum over ends is
+    multiplied: of a row of two cameras or points each end has its residual over the root of two
+    (structure/residual_slots.py)."""
     numbers = np.arange(size)
     return 2 * place[:, numbers // 2] + (numbers % 2)[:, None], 1 / np.sqrt(place.shape[2])

@@ -1,8 +1,9 @@
-"""A solution in which rows of residuals that do not fit the others have no weight: graduated non-convexity, as in
-results/graduated.py, of the rows of residuals and of clicked pixels in the place of all pixels.
+"""A solution in which rows of residuals that do not fit the others have no weight: graduated
+non-convexity, as in results/graduated.py, of the rows of residuals and of clicked pixels in the
+place of all pixels.
 
-A row has the weight `1 / (1 + (d / c)^2)^2` at a distance of d standard deviations. c falls from the distances of the
-start to those of rows that fit.
+A row has the weight `1 / (1 + (d / c)^2)^2` at a distance of d standard deviations. c falls from
+the distances of the start to those of rows that fit.
 
 Source: Black, Rangarajan 1996; Yang, Antonante, Tzoumas, Carlone 2020 (both as there)."""
 
@@ -25,8 +26,9 @@ from jaxba.problem.marks import whitening_of
 from jaxba.problem.residuals import Residual, Rows
 
 FIRST, LAST = 2.0, 4.0
-"""Scale at the start, and the residual beyond which a match is rejected, in medians of the residuals. With normal noise
-and without wrong matches the latter is 4.7 standard deviations, with 30% of them 6.3."""
+"""Scale at the start, and the residual beyond which a match is rejected, in medians of the
+residuals. With normal noise and without wrong matches the latter is 4.7 standard deviations, with
+30% of them 6.3."""
 
 FALL = 2.0
 """Scale of a stage over that of the next."""
@@ -45,7 +47,8 @@ def robust_solution(
     again: Callable[[BundleProblem, int], BundleProblem],
     dropped: RowsOfKinds = (),
 ) -> BundleProblem:
-    """The problem, with squared losses of its rows, at a solution that rows which do not fit do not pull.
+    """The problem, with squared losses of its rows, at a solution that rows which do not fit do not
+    pull.
 
     Args:
         problem: the start.
@@ -53,13 +56,18 @@ def robust_solution(
         again: solves a problem with a limit of iterations.
         dropped: rows that count as nothing."""
     rows = problem.residuals.rows
-    problem = problem.replace(residuals=replace(problem.residuals, rows=tuple(map(_with_weights, rows))))
+    problem = problem.replace(
+        residuals=replace(problem.residuals, rows=tuple(map(_with_weights, rows)))
+    )
     whitening = whitening_of(problem)
     problem = problem.replace(whitening=whitening)
     far = distances(problem, clicked)
     scales = [max(LEAST_SCALE, FIRST * _median(of_kind)) for of_kind in far]
     for _ in range(STAGES):
-        roots = [np.maximum(1 / (1 + (d / c) ** 2), LEAST_WEIGHT) for d, c in zip(far, scales, strict=True)]
+        roots = [
+            np.maximum(1 / (1 + (d / c) ** 2), LEAST_WEIGHT)
+            for d, c in zip(far, scales, strict=True)
+        ]
         for kind, row in dropped:
             roots[kind][row] = LEAST_WEIGHT
         solved = again(_weighted(problem, whitening, clicked, roots), STAGE_ITERATIONS)
@@ -69,14 +77,19 @@ def robust_solution(
         far = distances(problem, clicked)
         floors = [max(LEAST_SCALE, LAST * _median(of_kind)) for of_kind in far]
         ended = all(floor > 0.95 * scale for floor, scale in zip(floors, scales, strict=True))
-        if ended and all(np.allclose(x, y, rtol=0.05, atol=0.05) for x, y in zip(before, far, strict=True)):
+        if ended and all(
+            np.allclose(x, y, rtol=0.05, atol=0.05) for x, y in zip(before, far, strict=True)
+        ):
             break
         scales = [max(c / FALL, min(floor, c)) for floor, c in zip(floors, scales, strict=True)]
     return problem
 
 
-def distances(problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]) -> list[Float[np.ndarray, " _"]]:
-    """For each kind of residuals, and for clicked pixels, the RMS of the numbers of each row; large if not finite."""
+def distances(
+    problem: BundleProblem, clicked: Bool[np.ndarray, " observations"]
+) -> list[Float[np.ndarray, " _"]]:
+    """For each kind of residuals, and for clicked pixels, the RMS of the numbers of each row; large
+    if not finite."""
     whitened = [*residuals_of_rows(problem), geometry.residuals(problem.subset(clicked))]
     with np.errstate(all="ignore"):
         roots = [np.sqrt(np.mean(of_kind**2, axis=1)) for of_kind in whitened]
@@ -101,12 +114,19 @@ def _weighted(
 def _with(problem: BundleProblem, roots: list[Float[np.ndarray, " _"]]) -> Any:
     """The residuals with other factors."""
     rows = zip(problem.residuals.rows, roots, strict=False)
-    return replace(problem.residuals, rows=tuple(replace(x, data=(*x.data[:-1], root)) for x, root in rows))
+    return replace(
+        problem.residuals, rows=tuple(replace(x, data=(*x.data[:-1], root)) for x, root in rows)
+    )
 
 
 def _with_weights(rows: Rows) -> Rows:
     """Rows with a factor of each, as the last of their data."""
-    return replace(rows, residual=_times_weight(rows.residual), data=(*rows.data, np.ones(len(rows))), loss=Loss())
+    return replace(
+        rows,
+        residual=_times_weight(rows.residual),
+        data=(*rows.data, np.ones(len(rows))),
+        loss=Loss(),
+    )
 
 
 @functools.cache  # a new function would be compiled again

@@ -47,8 +47,8 @@ class Solution(ArrayRecord):
     """Result of `solve`."""
 
     problem: BundleProblem
-    """The input with optimised cameras and points. What has no observations is unchanged, except for shared
-    intrinsics."""
+    """The input with optimised cameras and points. What has no observations is unchanged, except
+    for shared intrinsics."""
 
     initial_cost: float
     """Pixels^2."""
@@ -78,16 +78,19 @@ class Solution(ArrayRecord):
     """Seconds for compilation; nearly zero if the compiled program was cached."""
 
     total_s: float
-    """Seconds for the iterations, and for retriangulations between them (results/alternation.py)."""
+    """Seconds for the iterations, and for retriangulations between them
+    (results/alternation.py)."""
 
     capacity: Capacity | None = None
     """Sizes to which the problem was padded; None if it was not."""
 
     quick_iterations: int = 0
-    """Number of iterations, the first ones, that ran at least in part in programs that were not fully optimised."""
+    """Number of iterations, the first ones, that ran at least in part in programs that were not
+    fully optimised."""
 
     set_aside: Int[np.ndarray, " away"] = field(default_factory=lambda: np.zeros(0, int))
-    """Cameras that face away from their points (problem/facing.py). Their views count in no cost, and they stay."""
+    """Cameras that face away from their points (problem/facing.py). Their views count in no cost,
+    and they stay."""
 
     lenses_free: bool = True
     """Whether `SolveOptions.intrinsics` were."""
@@ -103,9 +106,9 @@ class Solution(ArrayRecord):
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
-        """What was measured and does not fit: a line for each kind of residuals, besides pixels without a stated
-        accuracy, that fails a test of its standard deviations (solver/fit.py), with the names of its largest rows.
-        Computed when it is first asked for."""
+        """What was measured and does not fit: a line for each kind of residuals, besides pixels
+        without a stated accuracy, that fails a test of its standard deviations (solver/fit.py),
+        with the names of its largest rows. Computed when it is first asked for."""
         from jaxba.solver.notes import Solved, notes_of
 
         if not self.iterations:
@@ -113,7 +116,16 @@ class Solution(ArrayRecord):
         intrinsics = "free" if self.lenses_free else "fixed"
         options = SolveOptions(loss=self.loss, intrinsics=intrinsics)
         again = functools.partial(_continued, options)
-        return notes_of(Solved(self.start or self.problem, self.problem, self._counted, self.loss, intrinsics, again))
+        return notes_of(
+            Solved(
+                self.start or self.problem,
+                self.problem,
+                self._counted,
+                self.loss,
+                intrinsics,
+                again,
+            )
+        )
 
     @property
     def num_residuals(self) -> int:
@@ -139,28 +151,33 @@ class Solution(ArrayRecord):
 
     @property
     def distance(self) -> float:
-        """How far above its end the final cost is estimated to be, relative to it (`Tolerances.within`); infinite if
-        the last accepted step was shortened."""
+        """How far above its end the final cost is estimated to be, relative to it
+        (`Tolerances.within`); infinite if the last accepted step was shortened."""
         kept = np.flatnonzero(self.history.accepted)[-1:]
         with np.errstate(all="ignore"):
-            found = distance_to_end(StepInfo._make(np.asarray(x)[kept] for x in self.history), np.where)
+            found = distance_to_end(
+                StepInfo._make(np.asarray(x)[kept] for x in self.history), np.where
+            )
         return float(found[0]) if len(kept) else math.inf
 
     @property
     def costs(self) -> dict[str, float]:
-        """The final cost by kind: of `pixels`, and of each other residual by the name of its function; pixels^2."""
+        """The final cost by kind: of `pixels`, and of each other residual by the name of its
+        function; pixels^2."""
         others = costs_by_kind(self.problem)
         pixels = self.final_cost - sum(others.values()) if self.problem.num_observations else 0.0
         return {PIXELS: pixels, **others}
 
     def update(self, reconstruction: Any) -> None:
-        """Gives a `pycolmap.Reconstruction` what was found of its problem (`jaxba.from_pycolmap`)."""
+        """Gives a `pycolmap.Reconstruction` what was found of its problem
+        (`jaxba.from_pycolmap`)."""
         from jaxba.io.reconstruction import update
 
         update(reconstruction, self.problem)
 
     def plot(self) -> Picture:
-        """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""
+        """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a
+        notebook shows it."""
         from jaxba.solver.figure import plot_history
 
         return plot_history(self.history, self.initial_cost)
@@ -169,7 +186,8 @@ class Solution(ArrayRecord):
         return {
             "converged" if self.converged else "not converged": self.termination.reason,
             "cost": f"{self.initial_cost:.6g} -> {self.final_cost:.6g}",
-            "iterations": f"{self.iterations} in {self.total_s:.3g} s, compilation {self.compile_s:.3g} s",
+            "iterations": f"{self.iterations} in {self.total_s:.3g} s, compilation "
+            f"{self.compile_s:.3g} s",
         }
 
     def __repr__(self) -> str:
@@ -179,7 +197,10 @@ class Solution(ArrayRecord):
         from jaxba.problem.display import card
 
         size = {"size": f"{self.num_residuals} residuals, {self.num_parameters} parameters"}
-        return card({"problem": repr(self.problem).partition("(")[2][:-1], **size, **self._told()}, self.plot())
+        return card(
+            {"problem": repr(self.problem).partition("(")[2][:-1], **size, **self._told()},
+            self.plot(),
+        )
 
 
 def solve(
@@ -194,41 +215,42 @@ def solve(
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
-    A scene far from the origin relative to its size, as georeferenced scenes are, is shifted to the origin, solved and
-    shifted back (`preprocess.FAR`).
+    A scene far from the origin relative to its size, as georeferenced scenes are, is shifted to the
+    origin, solved and shifted back (`preprocess.FAR`).
 
-    Where other residuals than those of pixels fit badly, the scene is first moved, turned and scaled as a whole to what
-    they say, as far as constants, rigs and measured positions leave it free (solver/start.py); the initial cost is that
-    there.
+    Where other residuals than those of pixels fit badly, the scene is first moved, turned and
+    scaled as a whole to what they say, as far as constants, rigs and measured positions leave it
+    free (solver/start.py); the initial cost is that there.
 
-    An image with more than half of its views behind it is left out with a ProblemWarning (`Solution.set_aside`), unless
-    half of the images are like that.
+    An image with more than half of its views behind it is left out with a ProblemWarning
+    (`Solution.set_aside`), unless half of the images are like that.
 
-    Many problems of different shapes can be solved in one process: before compiled programs exceed the number
-    of memory mappings that Linux allows a process, all of them are dropped (`process.release_programs`) and compiled
-    again when needed.
+    Many problems of different shapes can be solved in one process: before compiled programs exceed
+    the number of memory mappings that Linux allows a process, all of them are dropped
+    (`process.release_programs`) and compiled again when needed.
 
     Args:
         problem: start of the optimisation.
-        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`). A name may
-            end with `+embedded`, all embedded iterations of the default agent around a rule, or `+refineK`, K point
-            iterations and no other refinement.
+        policy: damping policy, which chooses lambda in every iteration, or its name
+            (`jaxba.make_policy`). A name may end with `+embedded`, all embedded iterations of the
+            default agent around a rule, or `+refineK`, K point iterations and no other refinement.
         options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
-        watch: called before it, with the record and a function that gives the problem with the parameters after the
-            iteration; the time that it takes is not counted.
+        watch: called before it, with the record and a function that gives the problem with the
+            parameters after the iteration; the time that it takes is not counted.
         verbose: whether a row is printed for every iteration, and a line while programs compile.
-        checkpoint: file that is written once a minute and at the end, and from which the same solve continues; the
-            time of an earlier run does not count for `Tolerances.seconds`.
+        checkpoint: file that is written once a minute and at the end, and from which the same solve
+            continues; the time of an earlier run does not count for `Tolerances.seconds`.
 
     Returns:
         The optimised problem in NumPy float64 arrays, histories and timings.
 
     Raises:
-        ValueError: unknown names, or options that exclude each other, or that contradict the name of the policy.
-        ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
-            the method does not support what the problem has (shared lenses, priors, rigs), or the checkpoint is that of
-            another solve.
+        ValueError: unknown names, or options that exclude each other, or that contradict the name
+            of the policy.
+        ProblemError: the cost at the start is not finite, a factorisation needs more memory than
+            the machine has, or the method does not support what the problem has (shared lenses,
+            priors, rigs), or the checkpoint is that of another solve.
         RuntimeError: this process was forked from one in which JAX had started.
         TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`."""
     for name, function in (("callback", callback), ("watch", watch)):
@@ -249,7 +271,9 @@ def solve(
     found = solve_without(None, part.problem, policy, limit.rest(options), watch=watched, **hooks)
     limit.warn_if_too_short(found.termination, found.iterations)
     start = problem if problem.residuals else None
-    return replace(found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside], start=start)
+    return replace(
+        found, problem=whole(found.problem), set_aside=part.cameras[found.set_aside], start=start
+    )
 
 
 def solve_without(
@@ -263,17 +287,21 @@ def solve_without(
     waiting: Waiting = SILENT,
     checkpoint: Checkpoint | None = None,
 ) -> Solution:
-    """`solve` where it is known which images face away; None: it is not. `waiting` is told what takes time."""
+    """`solve` where it is known which images face away; None: it is not. `waiting` is told what
+    takes time."""
     options = checked_options(options)
     limit = TimeLimit(options)
     saved = checkpoint and checkpoint.load()
     problem, away = (saved.problem, saved.away) if saved else (problem, away)
     setup = set_up(problem, policy, options, away, in_parts=True, tell=waiting.tell)
     steps, records = None, saved.steps if saved else []
-    end = Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
+    end = (
+        Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
+    )
     if end == Termination.RUNNING and limit.is_over():
         end = Termination.TIME_LIMIT
-        options = replace(options, max_iterations=0)  # the cost of the start needs no program of a step
+        # the cost of the start needs no program of a step
+        options = replace(options, max_iterations=0)
     alone = not (callback or watch or checkpoint or limit.exists)
     with numerics(setup.dtype), CompileClock() as clock:
         driver = _driver(setup, options, clock, alone)
@@ -281,15 +309,29 @@ def solve_without(
         with waiting.compiling():
             state = driver.begin()
         setup.check_cost(state)
-        initial_cost, compiled, watched, began = float(state.cost), driver.compile_s(), 0.0, time.perf_counter()
-        initial_cost, before_s = (saved.initial_cost, saved.total_s) if saved else (initial_cost, 0.0)
-        elapsed = lambda: before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
+        initial_cost, compiled, watched, began = (
+            float(state.cost),
+            driver.compile_s(),
+            0.0,
+            time.perf_counter(),
+        )
+        initial_cost, before_s = (
+            (saved.initial_cost, saved.total_s) if saved else (initial_cost, 0.0)
+        )
+        elapsed = lambda: (
+            before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
+        )
         if saved and end == Termination.RUNNING:
             driver.carry = saved.continued(driver.carry)
             waiting.resume(len(records), before_s)
         if end == Termination.RUNNING and limit.is_over():
             end = Termination.TIME_LIMIT
-        if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise) and driver.whole:
+        if (
+            alone
+            and end == Termination.RUNNING
+            and not isinstance(driver, Stepwise)
+            and driver.whole
+        ):
             steps, end = driver.finish()
         while end == Termination.RUNNING and not isinstance(driver, Compiled):
             with waiting.iterating(len(records) + 1):
@@ -306,7 +348,13 @@ def solve_without(
                 end = Termination.TIME_LIMIT
             looked = time.perf_counter()
             if checkpoint and (checkpoint.due or end != Termination.RUNNING):
-                now = setup.problem_at(driver.carry.state), setup.away, initial_cost, record.time_s, records
+                now = (
+                    setup.problem_at(driver.carry.state),
+                    setup.away,
+                    initial_cost,
+                    record.time_s,
+                    records,
+                )
                 checkpoint.save(Saved(*now, carry=driver.carry))
             watched += time.perf_counter() - looked
         total_s, compile_s = elapsed(), driver.compile_s()
@@ -324,7 +372,8 @@ AGAIN = "ceres"
 
 
 def _continued(options: SolveOptions, problem: BundleProblem, iterations: int) -> BundleProblem:
-    """A problem after some more iterations, from Python, so that all limits use the same programs."""
+    """A problem after some more iterations, from Python, so that all limits use the same
+    programs."""
     options = replace(options, max_iterations=iterations)
     go_on = lambda record: False
     away = np.zeros(0, int)  # views of images that face away are left out already
@@ -332,10 +381,15 @@ def _continued(options: SolveOptions, problem: BundleProblem, iterations: int) -
 
 
 def solution_of(
-    setup: Setup, state: LMState, initial_cost: float, steps: StepInfo, end: Termination, total_s: float
+    setup: Setup,
+    state: LMState,
+    initial_cost: float,
+    steps: StepInfo,
+    end: Termination,
+    total_s: float,
 ) -> Solution:
-    """The solution of a solve that ended in a state, without the time of compilation; `initial_cost` in pixels^2,
-    `total_s` in seconds."""
+    """The solution of a solve that ended in a state, without the time of compilation;
+    `initial_cost` in pixels^2, `total_s` in seconds."""
     count, final_cost, counted = len(steps.cost), float(state.cost), setup.placed.counted
     gave_up = end in (Termination.DAMPING_LIMIT, Termination.STALLED)
     if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
@@ -360,13 +414,19 @@ def solution_of(
     )
 
 
-def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Compiled | OnDevices | Stepwise:
-    """The way to run the iterations: in stages of compilation, or where somebody looks at them, from Python."""
-    tolerances = options.tolerances._replace(seconds=None)  # with which programs are the same as without a limit
+def _driver(
+    setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool
+) -> Compiled | OnDevices | Stepwise:
+    """The way to run the iterations: in stages of compilation, or where somebody looks at them,
+    from Python."""
+    # with which programs are the same as without a limit
+    tolerances = options.tolerances._replace(seconds=None)
     arguments = setup, tolerances, options.max_iterations, clock
     if setup.shards is not None:
         return OnDevices(setup.shards, *arguments)
-    first = iterations_before(options.compilation, len(setup.placed.here.camera_index), setup.options)
+    first = iterations_before(
+        options.compilation, len(setup.placed.here.camera_index), setup.options
+    )
     if options.max_iterations and (first or not alone):
         return Stepwise(first, *arguments)
     return Compiled(*arguments)

@@ -1,4 +1,5 @@
-"""Where a solve starts: the scene where other residuals than those of pixels say that it is, as a whole."""
+"""Where a solve starts: the scene where other residuals than those of pixels say that it is, as a
+whole."""
 
 from __future__ import annotations
 
@@ -15,15 +16,18 @@ from jaxba.problem.moving import has_size, moved
 from jaxba.problem.preprocess import far_middle
 from jaxba.problem.similarity import Similarity, transformed
 
-MISFIT = 4.0  # mean square of whitened residuals, one for noise as stated, from which a scene may have to be moved
+# mean square of whitened residuals, one for noise as stated, from which a scene may have to be
+# moved
+MISFIT = 4.0
 
 WORTH = 0.5  # share of the cost of the residuals that may be left where the scene is moved
 
 
 def as_measured(problem: BundleProblem) -> BundleProblem:
-    """The problem with its scene moved, turned and scaled as residuals other than those of pixels say, where that
-    leaves at most half of their cost; else the problem itself. Pixels stay as they are, and so does what constants,
-    rigs, or rows that the scene is aligned with (`Rows.aligned`) determine."""
+    """The problem with its scene moved, turned and scaled as residuals other than those of pixels
+    say, where that leaves at most half of their cost; else the problem itself. Pixels stay as they
+    are, and so does what constants, rigs, or rows that the scene is aligned with (`Rows.aligned`)
+    determine."""
     kinds = problem.residuals.rows
     if all(rows.aligned for rows in kinds):
         return problem

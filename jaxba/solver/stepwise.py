@@ -1,9 +1,10 @@
 """Iterations run from Python, for callbacks and for programs that are replaced while they run.
 
-The iteration is that of iteration.py. It consists of three programs (linear solve, accept decision, policy), which are
-compiled in parallel, each with its own level of optimisation, and replaced by better ones when that pays
-(runtime/compilation.py). In one program the candidates of a step are turns of a loop (refinement/candidates.py). Here
-Python is that loop, so that camera rounds are compiled only if a solve has some. What is computed is the same."""
+The iteration is that of iteration.py. It consists of three programs (linear solve, accept decision,
+policy), which are compiled in parallel, each with its own level of optimisation, and replaced by
+better ones when that pays (runtime/compilation.py). In one program the candidates of a step are
+turns of a loop (refinement/candidates.py). Here Python is that loop, so that camera rounds are
+compiled only if a solve has some. What is computed is the same."""
 
 from __future__ import annotations
 
@@ -42,10 +43,11 @@ from jaxba.solver.iteration import Carry, advance, begin, problem_info
 from jaxba.structure.layout import Layout, num_partitions
 
 WORTH_S = 0.3
-"""Seconds of quickly compiled iterations, of all solves of a process together, from which on better programs are
-compiled for later calls, which spares them three quarters of it."""
+"""Seconds of quickly compiled iterations, of all solves of a process together, from which on better
+programs are compiled for later calls, which spares them three quarters of it."""
 
-_quick_seconds: defaultdict[Path, float] = defaultdict(float)  # of programs that were not fully optimised, by files
+# of programs that were not fully optimised, by files
+_quick_seconds: defaultdict[Path, float] = defaultdict(float)
 
 NEVER = sys.maxsize  # iterations before a step is fully optimised, if it never is
 
@@ -57,11 +59,12 @@ class Stepwise(Driver):
     """Iterations one at a time on one device, of programs at their own levels."""
 
     def __init__(self, first: int, *arguments: Any) -> None:
-        """`first` are the iterations before the step is fully optimised (`iterations_before`); other arguments as for
-        `Driver`."""
+        """`first` are the iterations before the step is fully optimised (`iterations_before`);
+        other arguments as for `Driver`."""
         super().__init__(*arguments)
         self._first, self._done = first, 0
-        self._stored: dict[str, bool] = {}  # whether the fully optimised program of a part is on disk
+        # whether the fully optimised program of a part is on disk
+        self._stored: dict[str, bool] = {}
         self._wanted: list[Wanted] = []  # those of which the quick ones were run
         self._ran_quick, self._quick_s = False, 0.0
         self._programs, self._compile_s = ParallelCompilation(), 0.0
@@ -74,7 +77,9 @@ class Stepwise(Driver):
         """The state at the start."""
         began, setup = time.perf_counter(), self.setup
         with self._programs as compile_programs:
-            self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
+            self._iterate(
+                compile_programs, self._begin(compile_programs, setup.initial(compile_programs))
+            )
         state = jax.block_until_ready(setup.initial(self._programs.run))
         self.carry = jax.block_until_ready(self._begin(self._programs.run, state))
         if self.clock.seconds > 0 or self._programs.loaded:
@@ -110,13 +115,14 @@ class Stepwise(Driver):
             _quick_seconds[each.path] += self._quick_s
         worth = [each for each in wanted if _quick_seconds[each.path] > WORTH_S]
         for each in worth:
-            del _quick_seconds[each.path]  # where another process is at it already, later solves ask again
+            # where another process is at it already, later solves ask again
+            del _quick_seconds[each.path]
         if worth:
             compile_later(worth)
 
     def _part(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, ...]:
-        """The program of a part of the step at its level, and its arguments. A fully optimised one that is on disk is
-        taken; one that is not is noted."""
+        """The program of a part of the step at its level, and its arguments. A fully optimised one
+        that is on disk is taken; one that is not is noted."""
         name, level = function.__name__, "quick" if self._done < self._first else "full"
         if level == "quick" and self._first < NEVER:
             if name not in self._stored:
@@ -133,12 +139,18 @@ class Stepwise(Driver):
         setup = self.setup
         info_program = program(problem_info, "options", level="quick")
         info = call(info_program, setup.layout, state, setup.options, self.limit)
-        # without the parameters, whose shapes differ, the policy's program is compiled once for all problems
+        # without the parameters, whose shapes differ, the policy's program is compiled once for all
+        # problems
         return call(program(begin, level="quick"), info, setup.policy, None)._replace(state=state)
 
     def _iterate(self, call: Call, carry: Carry) -> tuple[Carry, StepInfo, Any]:
         """One iteration: the next carry, its record, and the packed report for the host."""
-        state, layout, options, policy = carry.state, self.setup.layout, self.setup.options, self.setup.policy
+        state, layout, options, policy = (
+            carry.state,
+            self.setup.layout,
+            self.setup.options,
+            self.setup.policy,
+        )
 
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(policy.min_gain, state.cost.dtype)
@@ -150,7 +162,14 @@ class Stepwise(Driver):
         else:
             state, step = call(*self._part(try_step, *arguments))
         partitions = np.int32(num_partitions(layout))
-        policy_arguments = (carry._replace(state=None), step, policy, self.tolerances, self.limit, partitions)
+        policy_arguments = (
+            carry._replace(state=None),
+            step,
+            policy,
+            self.tolerances,
+            self.limit,
+            partitions,
+        )
         carry, report = call(program(_advance_and_pack, level="quick"), *policy_arguments)
         return carry._replace(state=state), step, report
 
@@ -177,14 +196,19 @@ def try_candidate(
     search: Search,
     refined: Float[Array, "parameters cameras"],
 ) -> tuple[Search, Int[Array, ""]]:
-    """One turn of the search for the candidate of a step, and what comes next. Arguments as for `next_search`."""
+    """One turn of the search for the candidate of a step, and what comes next. Arguments as for
+    `next_search`."""
     against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain)
     search = next_search(against, search, refined)
-    following = jnp.where(search.active, jnp.where(search.refining, CAMERA_ROUND, CANDIDATE), NOTHING)
+    following = jnp.where(
+        search.active, jnp.where(search.refining, CAMERA_ROUND, CANDIDATE), NOTHING
+    )
     return search, following
 
 
-def camera_round(layout: Layout, candidate: Candidate, options: StepOptions) -> Float[Array, "parameters cameras"]:
+def camera_round(
+    layout: Layout, candidate: Candidate, options: StepOptions
+) -> Float[Array, "parameters cameras"]:
     """The cameras of a candidate, each re-optimised on its own."""
     return refine_cameras(layout, candidate.cameras, candidate.points, options)
 
@@ -199,10 +223,11 @@ def try_step_by_parts(
     options: StepOptions,
     min_gain: Any,
 ) -> tuple[LMState, StepInfo]:
-    """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
+    """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs
+    or compiles.
 
-    Camera rounds are read from disk, but not compiled, before they are run. `part` gives the program of a part of the
-    step, at its present level, and the arguments."""
+    Camera rounds are read from disk, but not compiled, before they are run. `part` gives the
+    program of a part of the step, at its present level, and the arguments."""
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:
@@ -214,19 +239,36 @@ def try_step_by_parts(
             break
         if int(following) == CAMERA_ROUND:
             refined = call(*part(camera_round, layout, search.candidate, options))
-    return call(program(take_step, "options", level="quick"), layout, state, damping, proposal, search.best, options)
+    return call(
+        program(take_step, "options", level="quick"),
+        layout,
+        state,
+        damping,
+        proposal,
+        search.best,
+        options,
+    )
 
 
 def _advance_and_pack(
-    carry: Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any, partitions: Any
+    carry: Carry,
+    step: StepInfo,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    max_iterations: Any,
+    partitions: Any,
 ) -> tuple[Carry, Float[Array, " report"]]:
-    """`advance` without the parameters, and the record with the termination as one array: one transfer to the host."""
+    """`advance` without the parameters, and the record with the termination as one array: one
+    transfer to the host."""
     after = advance(carry, None, step, policy, tolerances, max_iterations, partitions)
     return after, jnp.stack([x.astype(step.cost.dtype) for x in (*step, after.termination)])
 
 
 def _unpack(report: Float[Array, " report"], shapes: StepInfo) -> tuple[StepInfo, Termination]:
-    """The record and the termination packed by `_advance_and_pack`, as Python scalars of the types of `shapes`."""
+    """The record and the termination packed by `_advance_and_pack`, as Python scalars of the types
+    of `shapes`."""
     *values, end = np.asarray(report).tolist()
     kinds = {"b": bool, "i": int, "f": float}
-    return StepInfo(*(kinds[x.dtype.kind](v) for v, x in zip(values, shapes, strict=True))), Termination(int(end))
+    return StepInfo(
+        *(kinds[x.dtype.kind](v) for v, x in zip(values, shapes, strict=True))
+    ), Termination(int(end))

@@ -31,7 +31,8 @@ class TimeLimit:
         return self._end < math.inf
 
     def is_over(self) -> bool:
-        """Whether the time is over. Of several processes the first one says so, since all must do the same."""
+        """Whether the time is over. Of several processes the first one says so, since all must do
+        the same."""
         return self.exists and together(lambda: clock() >= self._end)
 
     def rest(self, options: SolveOptions) -> SolveOptions:
@@ -42,7 +43,11 @@ class TimeLimit:
         return replace(options, tolerances=options.tolerances._replace(seconds=left))
 
     def warn_if_too_short(self, end: Termination, iterations: int) -> None:
-        """Warns with a ProblemWarning if a solve ended like this because the time was over before its iterations."""
+        """Warns with a ProblemWarning if a solve ended like this because the time was over before
+        its iterations."""
         if end == Termination.TIME_LIMIT and not iterations:
-            text = "the time limit was over before the first iteration, so that the result is the start"
+            text = (
+                "the time limit was over before the first iteration, so that the result is the "
+                "start"
+            )
             warnings.warn(text, ProblemWarning, stacklevel=3)

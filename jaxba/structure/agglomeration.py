@@ -7,19 +7,27 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-MAX_DENSE_ENTRIES = 1 << 20  # cameras times points up to which a sparse-dense product counts in half the time
-MAX_PRODUCTS = 2e7  # most pairs of observations that are counted to find common points; a second's work
+# cameras times points up to which a sparse-dense product counts in half the time
+MAX_DENSE_ENTRIES = 1 << 20
+# most pairs of observations that are counted to find common points; a second's work
+MAX_PRODUCTS = 2e7
 
 
 def shared_points(
-    camera: Int[np.ndarray, " observations"], point: Int[np.ndarray, " observations"], cameras: int, points: int
+    camera: Int[np.ndarray, " observations"],
+    point: Int[np.ndarray, " observations"],
+    cameras: int,
+    points: int,
 ) -> tuple[csr_matrix, Float[np.ndarray, " cameras"]]:
-    """Number of common points of each pair of cameras, without the diagonal, and number of points of each camera."""
+    """Number of common points of each pair of cameras, without the diagonal, and number of points
+    of each camera."""
     kept = np.ones(len(point), bool)
     work = float(np.sum(np.bincount(point).astype(float) ** 2))
     if work > MAX_PRODUCTS:  # a sample of the points is enough
         kept = point % int(-(-work // MAX_PRODUCTS)) == 0
-    seen = csr_matrix((np.ones(kept.sum(), np.float32), (camera[kept], point[kept])), shape=(cameras, points))
+    seen = csr_matrix(
+        (np.ones(kept.sum(), np.float32), (camera[kept], point[kept])), shape=(cameras, points)
+    )
     few = cameras * points <= MAX_DENSE_ENTRIES
     shared = csr_matrix(seen @ seen.T.toarray()) if few else (seen @ seen.T).tocsr()
     own = shared.diagonal().astype(float)
@@ -31,10 +39,11 @@ def shared_points(
 def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray, " nodes"]:
     """Agglomerative clustering of a graph.
 
-    In every round each group picks the group with the largest weight between them, divided by the product of their
-    sizes, and mutual picks are merged. Groups without common edges are merged arbitrarily at the end. `shared` are
-    symmetric edge weights without a diagonal, [nodes, nodes], and `clusters` is the largest number of groups. Returns
-    the label of each node, numbered from 0."""
+    In every round each group picks the group with the largest weight between them, divided by the
+    product of their sizes, and mutual picks are merged. Groups without common edges are merged
+    arbitrarily at the end. `shared` are symmetric edge weights without a diagonal, [nodes, nodes],
+    and `clusters` is the largest number of groups. Returns the label of each node, numbered from
+    0."""
     label, size, weight = np.arange(nodes), np.ones(nodes), shared
     while (groups := len(size)) > clusters:
         degree, column = np.diff(weight.indptr), weight.indices
@@ -44,7 +53,9 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
             affinity = weight.data / (size[row] * size[column])
             begin = weight.indptr[:-1][degree > 0]
             strength[degree > 0] = np.maximum.reduceat(affinity, begin)
-            best[degree > 0] = np.minimum.reduceat(np.where(affinity == strength[row], column, groups), begin)
+            best[degree > 0] = np.minimum.reduceat(
+                np.where(affinity == strength[row], column, groups), begin
+            )
         pair = np.flatnonzero(best >= 0)
         pair = pair[(best[best[pair]] == pair) & (pair < best[pair])]
         if not len(pair):
@@ -56,13 +67,17 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
         kept, new = np.unique(into, return_inverse=True)
         row, column = new[row], new[column]
         between = row != column
-        weight = csr_matrix((weight.data[between], (row[between], column[between])), shape=(len(kept), len(kept)))
+        weight = csr_matrix(
+            (weight.data[between], (row[between], column[between])), shape=(len(kept), len(kept))
+        )
         size, label = np.bincount(new, size), new[label]
     return np.unique(label, return_inverse=True)[1]
 
 
-def joined(label: Int[np.ndarray, " nodes"], index: Int[np.ndarray, " nodes"]) -> Int[np.ndarray, " clusters"]:
-    """A name for each cluster, the same for those with nodes of one index, also by way of others: a change of all nodes
-    of a name is one of whole indices."""
+def joined(
+    label: Int[np.ndarray, " nodes"], index: Int[np.ndarray, " nodes"]
+) -> Int[np.ndarray, " clusters"]:
+    """A name for each cluster, the same for those with nodes of one index, also by way of others: a
+    change of all nodes of a name is one of whole indices."""
     has = csr_matrix((np.ones(len(label)), (label, index)))
     return connected_components(has @ has.T, directed=False)[1]

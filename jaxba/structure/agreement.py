@@ -1,4 +1,5 @@
-"""What the layouts of the shards of a problem must have in common: sizes of arrays, and lists of blocks."""
+"""What the layouts of the shards of a problem must have in common: sizes of arrays, and lists of
+blocks."""
 
 from __future__ import annotations
 
@@ -10,11 +11,13 @@ import numpy as np
 
 
 class Agreement:
-    """Asked by name by the layout of one of several shards, with what it needs itself; knows what all of them need as
-    far as it was found in the round before. `ALONE` is that of the only shard, which needs nothing more."""
+    """Asked by name by the layout of one of several shards, with what it needs itself; knows what
+    all of them need as far as it was found in the round before. `ALONE` is that of the only shard,
+    which needs nothing more."""
 
     def __init__(self, known: dict[str, Any] | None, common: dict[str, Any]) -> None:
-        """`known` was found in the round before, `common` is what the shards of this round have in common so far."""
+        """`known` was found in the round before, `common` is what the shards of this round have in
+        common so far."""
         self._known, self._common, self._prefix = known, common, ""
         self.found: dict[str, Any] = {}
 
@@ -37,9 +40,14 @@ class Agreement:
         return np.union1d(own, self._asked("union " + name, own))
 
     def total(self, name: str, own: Callable[[], Any]) -> Any:
-        """The sum over all shards of an array or a sparse matrix, which depends on nothing else that is asked for."""
+        """The sum over all shards of an array or a sparse matrix, which depends on nothing else
+        that is asked for."""
         key = f"{self._prefix}total {name}"
-        return self._known[key] if self._known and key in self._known else self._asked("total " + name, own())
+        return (
+            self._known[key]
+            if self._known and key in self._known
+            else self._asked("total " + name, own())
+        )
 
     def once(self, name: str, value: Callable[[], Any]) -> Any:
         """A value that depends on totals and what else all shards have in common."""

@@ -1,7 +1,8 @@
-"""Cells: the capacities to which many problems of different sizes are padded, so that they share few programs.
+"""Cells: the capacities to which many problems of different sizes are padded, so that they share
+few programs.
 
-They are chosen from the sizes of problems that were seen, as few or as many as make the predicted time of compiling and
-solving the shortest."""
+They are chosen from the sizes of problems that were seen, as few or as many as make the predicted
+time of compiling and solving the shortest."""
 
 from __future__ import annotations
 
@@ -16,11 +17,13 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import MAX_CAMERAS, MAX_OBSERVATIONS, MAX_PAIRS, Capacity, slots_for
 
-ROUNDED = np.array([1, 16, 64, 256])  # sizes of cells are multiples of these, so that later problems fit
+# sizes of cells are multiples of these, so that later problems fit
+ROUNDED = np.array([1, 16, 64, 256])
 
 FIXED_S, CUBE_S, EACH_S = 5e-5, 2.5e-11, np.array([1e-5, 7e-7, 2.7e-7, 6e-9])
-"""Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that is padding, on
-windows of 5 to 20 cameras, x86-64 with AVX-512. The work for the pairs that there are is the same in every cell."""
+"""Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that
+is padding, on windows of 5 to 20 cameras, x86-64 with AVX-512. The work for the pairs that there
+are is the same in every cell."""
 
 ITERATIONS = 20  # iterations of a solve, as far as that matters for the number of cells
 COMPILE_S = 8.0  # seconds in which one core traces and compiles the program of a cell
@@ -33,7 +36,8 @@ class Sizes(NamedTuple):
     points: int
     slots: int
     pairs: int
-    exactly: int  # number of cameras that its cell must have, since not all that it holds can be padded; 0: any
+    # number of cameras that its cell must have, since not all that it holds can be padded; 0: any
+    exactly: int
 
     @classmethod
     def of(cls, problem: BundleProblem) -> Sizes:
@@ -80,9 +84,12 @@ def _cells_of_kind(seen: Sequence[Sizes], times: float) -> list[Sizes]:
     order = np.argsort(work(rows), kind="stable")
     rows, counts = rows[order], counts[order] * times * ITERATIONS
     number, before = len(rows), np.concatenate([[0], np.cumsum(counts)])
-    price = np.full((number + 1, number + 1), np.inf)  # of one cell, by the first of its rows and the one after them
+    # of one cell, by the first of its rows and the one after them
+    price = np.full((number + 1, number + 1), np.inf)
     for first in range(number):
-        price[first, first + 1 :] = work(np.maximum.accumulate(rows[first:])) * (before[first + 1 :] - before[first])
+        price[first, first + 1 :] = work(np.maximum.accumulate(rows[first:])) * (
+            before[first + 1 :] - before[first]
+        )
     best, cuts, saved = price[0], [], np.inf
     while True:
         with_one_more = best[:, None] + price

@@ -1,21 +1,23 @@
 """The layout of a problem: index arrays that turn its sparse sums into dense ones.
 
-An *observation slot*, slot for short, is a position in the arrays over observations; it holds one observation or is
-empty. Points with similar numbers of observations form a bucket; in a bucket, `n` points with up to `t` observations
-each own a tile of `t x n` slots, so that the sum over the observations of a point is a dense sum over `t`
-(structure/track_buckets.py). Sums over a camera, or over a block of the reduced camera system, are *summation trees*
-(structure/sum_trees.py). Padding of the index arrays refers to an empty slot, whose values are exactly zero.
+An *observation slot*, slot for short, is a position in the arrays over observations; it holds one
+observation or is empty. Points with similar numbers of observations form a bucket; in a bucket, `n`
+points with up to `t` observations each own a tile of `t x n` slots, so that the sum over the
+observations of a point is a dense sum over `t` (structure/track_buckets.py). Sums over a camera, or
+over a block of the reduced camera system, are *summation trees* (structure/sum_trees.py). Padding
+of the index arrays refers to an empty slot, whose values are exactly zero.
 
-The rows of the first level of the camera tree list the slots sorted by camera. The position of a slot in this list is
-its *camera-sorted index*.
+The rows of the first level of the camera tree list the slots sorted by camera. The position of a
+slot in this list is its *camera-sorted index*.
 
-With a fixed capacity (structure/padding.py) there are no buckets. Slots form chunks of two, which are summed densely;
-points are sorted by track length, so that those with an r-th chunk are the first ones, and sums over points are sums
-over r of gathered chunks.
+With a fixed capacity (structure/padding.py) there are no buckets. Slots form chunks of two, which
+are summed densely; points are sorted by track length, so that those with an r-th chunk are the
+first ones, and sums over points are sums over r of gathered chunks.
 
-The state, the camera model and all arrays over observations are components-first: cameras are `[9, cameras]`, points
-`[3, points]`, so that every component is a contiguous vector. Linear algebra and a `BundleProblem` are items-first:
-steps, gradients and right-hand sides of the reduced camera system are `[cameras, 9]`, its blocks `[cameras, 9, 9]`.
+The state, the camera model and all arrays over observations are components-first: cameras are `[9,
+cameras]`, points `[3, points]`, so that every component is a contiguous vector. Linear algebra and
+a `BundleProblem` are items-first: steps, gradients and right-hand sides of the reduced camera
+system are `[cameras, 9]`, its blocks `[cameras, 9, 9]`.
 
 Everything is computed once per problem, on the host, with vectorised NumPy."""
 
@@ -42,38 +44,48 @@ from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-CAMERA_CHUNK = 8  # observations per chunk of a camera. Their products are unrolled: it decides the program's size
+# observations per chunk of a camera. Their products are unrolled: it decides the program's size
+CAMERA_CHUNK = 8
 
 
 @register_pytree
 @dataclass(frozen=True, eq=False, repr=False)
 class Layout(ArrayRecord):
-    """A problem's observations in slot order, with the index arrays of their sums. Its points are in *layout order*."""
+    """A problem's observations in slot order, with the index arrays of their sums. Its points are
+    in *layout order*."""
 
     slot_camera: Int[AnyArray, " slots"]  # camera of each slot
     slot_point: Int[AnyArray, " slots"]  # point of each slot, in layout order
     slot_mask: Bool[AnyArray, " slots"]  # whether the slot holds an observation with pixels
-    slot_used: Bool[AnyArray, " slots"]  # whether it holds any, also one that stands for a row of a residual
-    observation: Int[AnyArray, " slots"]  # index in the problem of the observation of each slot; out of range if empty
+    # whether it holds any, also one that stands for a row of a residual
+    slot_used: Bool[AnyArray, " slots"]
+    # index in the problem of the observation of each slot; out of range if empty
+    observation: Int[AnyArray, " slots"]
     pixels: Float[AnyArray, "2 slots"]  # measured pixels; zero in empty slots
     whitening: Float[AnyArray, "2 2 slots"] | None  # `Sigma^(-1/2)` of each observation
-    points: Int[AnyArray, " points"]  # index in the problem of each point in layout order; out of range for padding
-    # in a layout with fixed capacity the ranks of chunks that are added to the first one of each point
-    # (`sum_trees.prefix_levels`); None for buckets
+    # index in the problem of each point in layout order; out of range for padding
+    points: Int[AnyArray, " points"]
+    # in a layout with fixed capacity the ranks of chunks that are added to the first one of each
+    # point (`sum_trees.prefix_levels`); None for buckets
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
-    # summation tree from slots to cameras. The flattened first level sorts the slots by camera and contains an empty
-    # one.
+    # summation tree from slots to cameras. The flattened first level sorts the slots by camera and
+    # contains an empty one.
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
-    camera_seen: Bool[AnyArray, " cameras"]  # cameras with at least one observation; the others are not optimised
-    pairs: PairLayout | None  # that form the reduced camera system; None if it is not formed from them
-    # slot of the observation of each point by each camera, an empty slot if there is none. Only where the reduced
-    # camera system is formed as one dense matrix product.
+    # cameras with at least one observation; the others are not optimised
+    camera_seen: Bool[AnyArray, " cameras"]
+    # that form the reduced camera system; None if it is not formed from them
+    pairs: PairLayout | None
+    # slot of the observation of each point by each camera, an empty slot if there is none. Only
+    # where the reduced camera system is formed as one dense matrix product.
     grid: Int[AnyArray, "points cameras"] | None
-    clusters: ClusterLayout | None  # clusters of the two-level preconditioner; None if it is not used
-    partitions: Partition | None  # random ones of the cameras, along a leading axis; None if no method uses them
+    # clusters of the two-level preconditioner; None if it is not used
+    clusters: ClusterLayout | None
+    # random ones of the cameras, along a leading axis; None if no method uses them
+    partitions: Partition | None
     unknowns: Unknowns  # camera models, and what is shared or constant
     residuals: tuple[ResidualSlots, ...]  # of one's own, and the slots that their rows have
-    buckets: tuple[Bucket, ...] = field(metadata={"static": True})  # shape of each bucket; none with fixed capacity
+    # shape of each bucket; none with fixed capacity
+    buckets: tuple[Bucket, ...] = field(metadata={"static": True})
     # axis of the mesh over which points are divided (structure/devices.py); none: all are here
     axes: tuple[str, ...] = field(default=(), metadata={"static": True})
 
@@ -93,13 +105,16 @@ class Layout(ArrayRecord):
         return self.camera_seen.shape[-1]
 
     def part(self, name: str) -> Any:
-        """Pairs, grid, clusters or partitions; a ValueError if the options that it was built for do not need them."""
+        """Pairs, grid, clusters or partitions; a ValueError if the options that it was built for do
+        not need them."""
         if getattr(self, name) is None:
             raise ValueError(f"this layout has no {name}: build it with the options of the step")
         return getattr(self, name)
 
 
-NO_SYSTEM = StepOptions(linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi"))
+NO_SYSTEM = StepOptions(
+    linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi")
+)
 """Options of a step whose layout has slots and their sums alone."""
 
 
@@ -112,23 +127,26 @@ def build_layout(
     grid: bool = True,
     agreement: Agreement = ALONE,
 ) -> Layout:
-    """Assigns a problem's observations to slots and builds the index arrays of their sums. Raises ValueError: arguments
-    that exclude each other, or a problem larger than the capacity.
+    """Assigns a problem's observations to slots and builds the index arrays of their sums. Raises
+    ValueError: arguments that exclude each other, or a problem larger than the capacity.
 
-    Returns a pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the
-    problem. With one they follow from the capacity, from whether there is whitening, from whether the system is one
-    dense product (`is_dense`), and from whether usual bounds hold: on tracks and blocks (`prefix_levels`), on
-    half-filled chunks (`Capacity.usual_observations`), and on how often cameras see points twice (`room_for`).
+    Returns a pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track
+    lengths of the problem. With one they follow from the capacity, from whether there is whitening,
+    from whether the system is one dense product (`is_dense`), and from whether usual bounds hold:
+    on tracks and blocks (`prefix_levels`), on half-filled chunks (`Capacity.usual_observations`),
+    and on how often cameras see points twice (`room_for`).
 
     Args:
-        problem: a checked problem, `in_frames` if it has rigs, `laid_out` if it has other residuals than those of
-            pixels; host arrays.
-        options: of the step: the layout has exactly the parts that it needs. If it forms the reduced camera system, it
-            lists pairs of observations: `t (t + 1) / 2` of each point with t observations.
-        capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
+        problem: a checked problem, `in_frames` if it has rigs, `laid_out` if it has other residuals
+            than those of pixels; host arrays.
+        options: of the step: the layout has exactly the parts that it needs. If it forms the
+            reduced camera system, it lists pairs of observations: `t (t + 1) / 2` of each point
+            with t observations.
+        capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it
+            is a band.
         observations: the sorted observations of the problem, if they are known already.
-        grid: whether a factored system may be formed as one dense matrix product instead of from pairs, where that is
-            cheaper (structure/density.py).
+        grid: whether a factored system may be formed as one dense matrix product instead of from
+            pairs, where that is cheaper (structure/density.py).
         agreement: with the layouts of the other shards of a problem (solver/sharded.py)."""
     factor, pairs = options.factors_reduced_system, options.forms_reduced_system
     if capacity is not None and not factor:
@@ -141,11 +159,16 @@ def build_layout(
     seen = np.bincount(camera, minlength=cameras)
     is_seen = agreement.total("seen", lambda: seen) > 0
 
-    slots = bucket_slots(tracks, agreement.within("buckets")) if capacity is None else padded_slots(tracks, capacity)
+    slots = (
+        bucket_slots(tracks, agreement.within("buckets"))
+        if capacity is None
+        else padded_slots(tracks, capacity)
+    )
     slot, empty, count = slots.slot, slots.empty, len(slots.point)
 
     def in_slots(values: np.ndarray, otherwise: Any = 0) -> np.ndarray:
-        """Values of the sorted observations, which are their first axis, as the last axis of the slots."""
+        """Values of the sorted observations, which are their first axis, as the last axis of the
+        slots."""
         found = np.full((*values.shape[1:], count), otherwise, values.dtype)
         found[..., slot] = np.moveaxis(values, 0, -1)
         return found
@@ -185,9 +208,13 @@ def build_layout(
             agreement=agreement.within("pairs"),
         )
     if options.cluster_cameras is not None and pair_lists is not None:
-        drawn_partitions = partition_layout(observations, slots, pair_lists, options.cluster_cameras)
+        drawn_partitions = partition_layout(
+            observations, slots, pair_lists, options.cluster_cameras
+        )
     if options.uses_camera_clusters:
-        camera_clusters = cluster_layout(observations, slots, unknowns, agreement.within("clusters"))
+        camera_clusters = cluster_layout(
+            observations, slots, unknowns, agreement.within("clusters")
+        )
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slots.point,
@@ -211,5 +238,6 @@ def build_layout(
 
 
 def num_partitions(layout: Layout) -> int:
-    """Number of partitions that iterations cycle through, and so of different steps from one state and lambda."""
+    """Number of partitions that iterations cycle through, and so of different steps from one state
+    and lambda."""
     return 1 if layout.partitions is None else layout.partitions.label.shape[0]

@@ -1,4 +1,5 @@
-"""Observations sorted by point, then by camera. Computed once per solve, for cost model, padding and layout."""
+"""Observations sorted by point, then by camera. Computed once per solve, for cost model, padding
+and layout."""
 
 from __future__ import annotations
 
@@ -23,17 +24,26 @@ class ObservationOrder:
     point: Int[np.ndarray, " observations"]  # point of each sorted observation
     tracks: Int[np.ndarray, " points"]  # number of observations of each point
     num_cameras: int  # number of cameras, observed or not
-    moves: Bool[np.ndarray, " observations"]  # whether something of the camera of each sorted observation is optimised
+    # whether something of the camera of each sorted observation is optimised
+    moves: Bool[np.ndarray, " observations"]
 
     @classmethod
     def of(cls, problem: BundleProblem) -> ObservationOrder:
-        """Sorts the observations of a problem in linear time; ties keep the order of the problem."""
+        """Sorts the observations of a problem in linear time; ties keep the order of the
+        problem."""
         camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
         cameras, points = len(problem.cameras), len(problem.points)
         order = sorted_by(camera, cameras)
         order = order[sorted_by(point[order], points)]
         tracks = np.bincount(point, minlength=points)
-        return cls(order, camera[order], point[order], tracks, cameras, _moving_cameras(problem)[camera[order]])
+        return cls(
+            order,
+            camera[order],
+            point[order],
+            tracks,
+            cameras,
+            _moving_cameras(problem)[camera[order]],
+        )
 
     @cached_property
     def moving_tracks(self) -> Int[np.ndarray, " points"]:
@@ -42,8 +52,9 @@ class ObservationOrder:
 
     @cached_property
     def num_pairs(self) -> int:
-        """Number of unordered pairs of observations of one point by cameras of which something is optimised, an
-        observation with itself included. Others add nothing to the reduced camera system."""
+        """Number of unordered pairs of observations of one point by cameras of which something is
+        optimised, an observation with itself included. Others add nothing to the reduced camera
+        system."""
         tracks = self.moving_tracks.astype(np.int64)
         return int(np.sum(tracks * (tracks + 1) // 2))
 
@@ -58,7 +69,8 @@ class ObservationOrder:
 
     @property
     def num_listed_pairs(self) -> int:
-        """Number of pairs as a layout lists them: if a camera sees a point twice, in both orders (covisibility.py)."""
+        """Number of pairs as a layout lists them: if a camera sees a point twice, in both orders
+        (covisibility.py)."""
         return self.num_pairs + self.num_repeated_pairs
 
     @cached_property
@@ -68,7 +80,8 @@ class ObservationOrder:
 
 
 def _moving_cameras(problem: BundleProblem) -> Bool[np.ndarray, " cameras"]:
-    """Of which cameras something is optimised, of a problem `in_frames`: of pose, lens, or a block of a residual."""
+    """Of which cameras something is optimised, of a problem `in_frames`: of pose, lens, or a block
+    of a residual."""
     if problem.residuals.sizes:
         return np.ones(len(problem.cameras), bool)
     lenses = every_lens(problem)

@@ -1,17 +1,19 @@
 """Array sizes rounded up to a coarse grid, so that similar problems share one compiled program.
 
-A compiled program fits one set of array shapes. Without padding these follow from the data (buckets by track length,
-summation trees, pairs), so that every problem compiles its own program, which takes seconds where the solve may take a
-fraction of one. With padding all shapes follow from a `Capacity`, five numbers on a grid, but for few problems with
-unusually long tracks or many small blocks (`sum_trees.prefix_levels`). Which cameras share a lens and what is constant
-is data. Padding contains no observations: it adds exact zeros to sums, and its cameras and points never change.
+A compiled program fits one set of array shapes. Without padding these follow from the data (buckets
+by track length, summation trees, pairs), so that every problem compiles its own program, which
+takes seconds where the solve may take a fraction of one. With padding all shapes follow from a
+`Capacity`, five numbers on a grid, but for few problems with unusually long tracks or many small
+blocks (`sum_trees.prefix_levels`). Which cameras share a lens and what is constant is data. Padding
+contains no observations: it adds exact zeros to sums, and its cameras and points never change.
 
-A tenth to a third of the slots are padding: from rounding, and in half-filled chunks. The grid is coarse for small
-problems, where a program costs more than its padding: of the adjustments of a COLMAP mapper, which take three
-iterations each, 95 on 36 images of KITTI need 30 programs, and 54 with eight numbers of slots an octave. Larger
-problems are not padded (`capacity_of`), since their iterations take as long as compiling does. A problem with few
-points may lose more than others: with padding it may have too many of them for Woodbury's identity
-(structure/density.py)."""
+A tenth to a third of the slots are padding: from rounding, and in half-filled chunks. The grid is
+coarse for small
+problems, where a program costs more than its padding: of the adjustments of a COLMAP mapper, which
+take three iterations each, 95 on 36 images of KITTI need 30 programs, and 54 with eight numbers of
+slots an octave. Larger problems are not padded (`capacity_of`), since their iterations take as long
+as compiling does. A problem with few points may lose more than others: with padding it may have too
+many of them for Woodbury's identity (structure/density.py)."""
 
 from __future__ import annotations
 
@@ -26,15 +28,23 @@ from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
 CAMERAS = (8, 16, 32, 48, 64, 96, 128)  # longer sequences are better factored as bands
-LENSES = (0, 1, 4, 16, 64)  # of shared lenses; each takes as many products with the system as it has free numbers
-POINT_CHUNK = 2  # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
-MIN_OBSERVATIONS = 1024  # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
-COARSE_OBSERVATIONS = 1 << 14  # slots up to which two sizes an octave suffice, where a step takes 5 ms; then four
-POINTS_PER_CHUNK = (1 / 2, 3 / 4, 1)  # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
-PAIRS_PER_SLOT = 6  # or 2, 4, ... times as many. Windows of kitti00vo have 2.9 to 4.2; spare pairs cost little
+# of shared lenses; each takes as many products with the system as it has free numbers
+LENSES = (0, 1, 4, 16, 64)
+# slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
+POINT_CHUNK = 2
+# smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
+MIN_OBSERVATIONS = 1024
+# slots up to which two sizes an octave suffice, where a step takes 5 ms; then four
+COARSE_OBSERVATIONS = 1 << 14
+# of the capacity, as few as suffice. Real problems have 0.2 to 0.6
+POINTS_PER_CHUNK = (1 / 2, 3 / 4, 1)
+# or 2, 4, ... times as many. Windows of kitti00vo have 2.9 to 4.2; spare pairs cost little
+PAIRS_PER_SLOT = 6
 MAX_CAMERAS = CAMERAS[-1]  # most cameras of a padded problem
-MAX_OBSERVATIONS = 1 << 17  # most slots of a padded problem. On Ladybug-49 a step takes 0.4 us per slot
-MAX_PAIRS = 1 << 20  # most pairs of a padded problem. Measured: 0.1 us per pair and step, twenty steps take two seconds
+# most slots of a padded problem. On Ladybug-49 a step takes 0.4 us per slot
+MAX_OBSERVATIONS = 1 << 17
+# most pairs of a padded problem. Measured: 0.1 us per pair and step, twenty steps take two seconds
+MAX_PAIRS = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -43,30 +53,40 @@ class Capacity:
 
     cameras: int
     points: int
-    observations: int  # number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty
+    # number of slots in chunks of `POINT_CHUNK`, of which one chunk is always empty
+    observations: int
     pairs: int  # number of pairs of observations of one point, an observation with itself included
     lenses: int = 0  # number of lenses that several cameras share
-    # whether shapes follow from these numbers alone, with room for all that they may hold, unless a camera sees a point
-    # twice. Else they are smaller where the problem is a usual one.
+    # whether shapes follow from these numbers alone, with room for all that they may hold, unless a
+    # camera sees a point twice. Else they are smaller where the problem is a usual one.
     fixed: bool = False
 
     def holds(self, observations: ObservationOrder) -> bool:
         """Whether the problem fits; its pairs are not counted."""
         counts = observations.num_cameras, len(observations.tracks), slots_for(observations.tracks)
-        return all(n <= most for n, most in zip(counts, (self.cameras, self.points, self.observations), strict=True))
+        return all(
+            n <= most
+            for n, most in zip(counts, (self.cameras, self.points, self.observations), strict=True)
+        )
 
     def __str__(self) -> str:
-        return f"{self.cameras} cameras, {self.points} points, {self.observations} observations, {self.pairs} pairs"
+        return (
+            f"{self.cameras} cameras, {self.points} points, {self.observations} observations, "
+            f"{self.pairs} pairs"
+        )
 
 
-def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
+def capacity_of(
+    problem: BundleProblem, observations: ObservationOrder | None = None
+) -> Capacity | None:
     """The capacity of a problem: its sizes rounded up to the grid.
 
-    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to two sizes an octave, or four if there
-    are many. Points and pairs get a fixed multiple of the slots, or the next larger one if that is not enough: rounding
-    each on its own would give more programs. `observations` are the sorted ones of the problem, if they are known
-    already. Returns None for problems with rigs or other residuals than those of pixels, with more than `MAX_CAMERAS`
-    or `MAX_PAIRS` or than the last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
+    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to two sizes an octave, or
+    four if there are many. Points and pairs get a fixed multiple of the slots, or the next larger
+    one if that is not enough: rounding each on its own would give more programs. `observations` are
+    the sorted ones of the problem, if they are known already. Returns None for problems with rigs
+    or other residuals than those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS` or than the
+    last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
     observations = observations or ObservationOrder.of(problem)
     cameras, points = observations.num_cameras, len(observations.tracks)
     if problem.rigs or problem.residuals or cameras > MAX_CAMERAS:
@@ -105,9 +125,10 @@ def slots_for(tracks: Int[np.ndarray, " points"]) -> int:
 def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> Room:
     """Room of a summation tree in a layout with fixed capacity.
 
-    A target has at most `expected` items unless a camera sees a point twice. If some target has more, the tree gets
-    room for all items in one target, which takes one or two more levels. `counts` are numbers of items of each target,
-    `items` is the capacity for those of all targets."""
+    A target has at most `expected` items unless a camera sees a point twice. If some target has
+    more, the tree gets room for all items in one target, which takes one or two more levels.
+    `counts` are numbers of items of each target, `items` is the capacity for those of all
+    targets."""
     return Room(items, min(items, expected) if counts.max(initial=0) <= expected else items)
 
 
@@ -115,14 +136,17 @@ def padded_parameters(
     problem: BundleProblem, capacity: Capacity
 ) -> tuple[Float[np.ndarray, "cameras parameters"], Float[np.ndarray, "points 3"]]:
     """The problem's cameras and points, padded with zeros to the capacity."""
-    padded = lambda rows, count: np.pad(np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0)))
+    padded = lambda rows, count: np.pad(
+        np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0))
+    )
     return padded(problem.cameras, capacity.cameras), padded(problem.points, capacity.points)
 
 
 def _rounded_slots(needed: int) -> int:
     """The number of slots of the grid at or above those that a problem needs."""
     power = _power(max(MIN_OBSERVATIONS, needed))
-    step = power // 4 if power <= COARSE_OBSERVATIONS else power // 8  # of sizes from half of the power up to it
+    # of sizes from half of the power up to it
+    step = power // 4 if power <= COARSE_OBSERVATIONS else power // 8
     return max(MIN_OBSERVATIONS, -(-needed // step) * step)
 
 

@@ -1,10 +1,11 @@
 """Random partitions of the cameras into clusters, for the method STBA (methods/stba.py).
 
-A fixed number of partitions is drawn once per problem, with their index arrays, and iteration t uses number t modulo
-that number. Random clusters then cost nothing during the iterations, and the solve is one compiled program.
+A fixed number of partitions is drawn once per problem, with their index arrays, and iteration t
+uses number t modulo that number. Random clusters then cost nothing during the iterations, and the
+solve is one compiled program.
 
-A point that is seen from several clusters is a *shared point*. STBA splits it into *point replicas*, one per cluster,
-each with the observations of that cluster."""
+A point that is seen from several clusters is a *shared point*. STBA splits it into *point
+replicas*, one per cluster, each with the observations of that cluster."""
 
 from __future__ import annotations
 
@@ -34,11 +35,13 @@ class Partition:
     """One partition of the cameras, or several along a leading axis."""
 
     label: Int[AnyArray, "*t cameras"]  # cluster of each camera
-    members: Int[AnyArray, "*t clusters size"]  # cameras of each cluster, in order; padded with the number of cameras
-    # index in `PairLayout` of the block of two members, lower triangle; else that of the zero block, and one past it on
-    # the diagonal of the padding
+    # cameras of each cluster, in order; padded with the number of cameras
+    members: Int[AnyArray, "*t clusters size"]
+    # index in `PairLayout` of the block of two members, lower triangle; else that of the zero
+    # block, and one past it on the diagonal of the padding
     blocks: Int[AnyArray, "*t clusters size size"]
-    slot_replica: Int[AnyArray, "*t slots"]  # point replica of each slot; the last, without observations, of empty ones
+    # point replica of each slot; the last, without observations, of empty ones
+    slot_replica: Int[AnyArray, "*t slots"]
     levels: tuple[Int[AnyArray, "*t _ _"], ...]  # summation tree from slots to point replicas
 
     def at(self, iteration: int | Int[Array, ""]) -> Partition:
@@ -48,9 +51,11 @@ class Partition:
         return jax.tree.map(lambda x: x[iteration % count], arrays)
 
 
-def partition_layout(observations: ObservationOrder, slots: Slots, pairs: PairLayout, largest: int) -> Partition:
-    """Draws partitions of a problem into clusters of at most `largest` cameras; only one if all cameras fit in one
-    cluster. The pairs are not banded."""
+def partition_layout(
+    observations: ObservationOrder, slots: Slots, pairs: PairLayout, largest: int
+) -> Partition:
+    """Draws partitions of a problem into clusters of at most `largest` cameras; only one if all
+    cameras fit in one cluster. The pairs are not banded."""
     from jaxba.structure.louvain import camera_graph, clusterings  # SciPy: its import takes 0.2 s
 
     camera, point, cameras = observations.camera, observations.point, observations.num_cameras
@@ -66,16 +71,21 @@ def partition_layout(observations: ObservationOrder, slots: Slots, pairs: PairLa
     keys = (point.astype(np.int64) * clusters + label[camera] for label in labels)
     replicas = [np.unique(key, return_inverse=True, return_counts=True)[1:] for key in keys]
     most = max(len(counts) for _, counts in replicas) + 1
-    room = Room(len(camera), max(int(counts.max()) for _, counts in replicas))  # for trees of equal shapes
+    # for trees of equal shapes
+    room = Room(len(camera), max(int(counts.max()) for _, counts in replicas))
     trees, slot_replica = [], np.full((len(labels), len(slots.point)), most - 1, np.int32)
     for number, (which, counts) in enumerate(replicas):
         items = slots.slot[np.argsort(which, kind="stable")]
-        trees.append(sum_tree(items, np.pad(counts, (0, most - len(counts))), slots.empty, TREE_WIDTH, room))
+        trees.append(
+            sum_tree(items, np.pad(counts, (0, most - len(counts))), slots.empty, TREE_WIDTH, room)
+        )
         slot_replica[number, slots.slot] = which
     return Partition(
         label=labels.astype(np.int32),
         members=np.stack(tables),
-        blocks=np.stack([_blocks(table, label, pairs) for table, label in zip(tables, labels, strict=True)]),
+        blocks=np.stack(
+            [_blocks(table, label, pairs) for table, label in zip(tables, labels, strict=True)]
+        ),
         slot_replica=slot_replica,
         levels=tuple(map(np.stack, zip(*trees, strict=True))),
     )

@@ -1,16 +1,19 @@
-"""Rows of residuals as observations, so that everything that is summed over observations is summed over them, too.
+"""Rows of residuals as observations, so that everything that is summed over observations is summed
+over them, too.
 
-An observation has one camera and one point, and a slot for its two residuals (structure/layout.py). A row of n numbers
-is laid out as n / 2 observations of its camera and its point, without pixels. What a row lacks is made up for by zero
-columns: a row without a camera has some camera that sees its point, one without a point has a new point of its own.
+An observation has one camera and one point, and a slot for its two residuals (structure/layout.py).
+A row of n numbers is laid out as n / 2 observations of its camera and its point, without pixels.
+What a row lacks is made up for by zero columns: a row without a camera has some camera that sees
+its point, one without a point has a new point of its own.
 
-A row of two cameras is split by a variable v, for each pair of residuals a new point. With `r + a + b` for the residual
-and its first-order changes by the two cameras,
+A row of two cameras is split by a variable v, for each pair of residuals a new point. With `r + a +
+b` for the residual and its first-order changes by the two cameras,
 
     min_v  |sqrt(2) (r/2 + a + v)|^2 + |sqrt(2) (r/2 + b - v)|^2  =  |r + a + b|^2
 
-so that eliminating v like any point gives the block of the two cameras. Damping also holds v, by the share lambda.
-A row of two points is split in the same way by numbers of the pose of a new camera."""
+so that eliminating v like any point gives the block of the two cameras. Damping also holds v, by
+the share lambda. A row of two points is split in the same way by numbers of the pose of a new
+camera."""
 
 from __future__ import annotations
 
@@ -37,24 +40,29 @@ class ResidualSlots(ArrayRecord):
 
     rows: Rows  # the function and its data
     cameras: tuple[Int[AnyArray, " rows"], ...]  # one or two cameras of each row
-    points: tuple[Int[AnyArray, " rows"], ...]  # one or two points of each row, in layout order; any if it takes none
-    # slots of each row: of each pair of numbers, and each of its one or two cameras or points; out of range where there
-    # is none
+    # one or two points of each row, in layout order; any if it takes none
+    points: tuple[Int[AnyArray, " rows"], ...]
+    # slots of each row: of each pair of numbers, and each of its one or two cameras or points; out
+    # of range where there is none
     slots: Int[AnyArray, "pairs ends rows"]
-    # for each unknown of the function first and last number of its block among a camera's parameters; (0, 0) where it
-    # is no block
+    # for each unknown of the function first and last number of its block among a camera's
+    # parameters; (0, 0) where it is no block
     places: tuple[tuple[int, int], ...] = field(metadata={"static": True})
 
 
 def laid_out(problem: BundleProblem) -> BundleProblem:
-    """A problem `in_frames` with its blocks after the numbers of cameras, and observations that stand for its residuals
-    after those of pixels, with new points and cameras where they need them. Without residuals it is the problem itself.
-    Raises ProblemError: see `owners_of`."""
+    """A problem `in_frames` with its blocks after the numbers of cameras, and observations that
+    stand for its residuals after those of pixels, with new points and cameras where they need them.
+    Without residuals it is the problem itself. Raises ProblemError: see `owners_of`."""
     residuals = problem.residuals
     if not residuals:
         return problem
     camera, point = [np.asarray(problem.camera_index)], [np.asarray(problem.point_index)]
-    observations, points, cameras = problem.num_observations, problem.num_points, problem.num_cameras
+    observations, points, cameras = (
+        problem.num_observations,
+        problem.num_points,
+        problem.num_cameras,
+    )
     found, groups = [], block_groups(problem)
     sees = np.zeros(problem.num_points + 1, int)  # the last for no point
     sees[point[0]] = camera[0]
@@ -69,23 +77,33 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         if len(owners.cameras) == 2:  # a point for each pair of numbers
             at = points + np.arange(len(rows) * pairs).reshape(-1, pairs, 1)
         own = np.stack(own, axis=1)[:, None]
-        points, cameras = (max(x, int(y.max(initial=-1)) + 1) for x, y in ((points, at), (cameras, own)))
+        points, cameras = (
+            max(x, int(y.max(initial=-1)) + 1) for x, y in ((points, at), (cameras, own))
+        )
         camera.append(np.broadcast_to(own, shape).ravel())
         point.append(np.broadcast_to(at, shape).ravel())
         size = len(camera[-1])
         found.append(replace(rows, observation=observations + np.arange(size).reshape(shape)))
         observations += size
     more, extra = observations - problem.num_observations, points - problem.num_points
-    rest = lambda x, count: np.concatenate([np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)])
+    rest = lambda x, count: np.concatenate(
+        [np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)]
+    )
     new = np.arange(cameras - problem.num_cameras)
     groups = [np.append(own, -cameras + new) for own in groups]
-    every = np.append(np.arange(problem.num_cameras), 0 * new)  # new ones have the lens of the first
+    # new ones have the lens of the first
+    every = np.append(np.arange(problem.num_cameras), 0 * new)
     held, rigs, pairs = problem.constants, problem.rigs, zip(residuals.blocks, groups, strict=True)
-    blocks = (np.where((own >= 0)[:, None], np.asarray(x)[np.maximum(own, 0)], 0.0) for x, own in pairs)
+    blocks = (
+        np.where((own >= 0)[:, None], np.asarray(x)[np.maximum(own, 0)], 0.0) for x, own in pairs
+    )
     if held is not None:
         held = Constants(rest(held.poses, len(new)), rest(held.points, extra))
     if rigs is not None:
-        rigs = replace(rigs.of(every), frame=np.append(rigs.frame, np.max(rigs.frame) + 1 + new).astype(np.int32))
+        rigs = replace(
+            rigs.of(every),
+            frame=np.append(rigs.frame, np.max(rigs.frame) + 1 + new).astype(np.int32),
+        )
     return problem.replace(
         cameras=np.hstack([np.asarray(problem.cameras)[every], *blocks]),
         points=rest(problem.points, extra),
@@ -128,9 +146,9 @@ def residual_slots(
     points: Int[np.ndarray, " points"],
     agreement: Agreement,
 ) -> tuple[ResidualSlots, ...]:
-    """Rows of a problem that is `laid_out`. `slot` is that of each of the sorted observations, `sorted_observations`
-    are their positions in the problem, `points` the points at each position in layout order, and `agreement` is that
-    with the other shards of the problem."""
+    """Rows of a problem that is `laid_out`. `slot` is that of each of the sorted observations,
+    `sorted_observations` are their positions in the problem, `points` the points at each position
+    in layout order, and `agreement` is that with the other shards of the problem."""
     residuals = problem.residuals
     if not residuals:
         return ()
@@ -149,7 +167,8 @@ def residual_slots(
         rows = rows.of(np.where(lost, 0, kept))
         observation = np.where(lost[:, None, None], -1, rows.observation)
         own = np.where(observation < 0, NOWHERE, slot_of[observation]).astype(np.int32)
-        own_cameras = slice(2 if len(rows.points) == 1 else 1)  # both ends of a row of two points have the same camera
+        # both ends of a row of two points have the same camera
+        own_cameras = slice(2 if len(rows.points) == 1 else 1)
         camera = np.asarray(problem.camera_index)[observation.max(axis=1)[:, own_cameras]]
         found.append(
             ResidualSlots(
@@ -157,7 +176,9 @@ def residual_slots(
                 cameras=tuple(camera.T),
                 points=tuple(order[np.maximum(own, 0)] for own in rows.points),
                 slots=np.moveaxis(own, 0, 2),
-                places=tuple(places.get(name.removesuffix(SECOND), (0, 0)) for name in rows.residual.unknowns),
+                places=tuple(
+                    places.get(name.removesuffix(SECOND), (0, 0)) for name in rows.residual.unknowns
+                ),
             )
         )
     return tuple(found)

@@ -1,4 +1,5 @@
-"""Which numbers are one unknown, and which are constant. Where all differ, or all are free, there is nothing to do."""
+"""Which numbers are one unknown, and which are constant. Where all differ, or all are free, there
+is nothing to do."""
 
 from __future__ import annotations
 
@@ -25,16 +26,18 @@ class Sharing(ArrayRecord):
 
     @classmethod
     def of(cls, names: Int[np.ndarray, " items"]) -> Sharing:
-        """Items of equal names are one unknown; unknowns are in the order of their first items. Items with negative
-        names are not computed with, and own nothing."""
-        unique, first, own, times = np.unique(names, return_index=True, return_inverse=True, return_counts=True)
+        """Items of equal names are one unknown; unknowns are in the order of their first items.
+        Items with negative names are not computed with, and own nothing."""
+        unique, first, own, times = np.unique(
+            names, return_index=True, return_inverse=True, return_counts=True
+        )
         rank = np.argsort(np.argsort(first)).astype(np.int32)
         owners = np.sort(rank[(times > 1) & (unique >= 0)])
         return cls(rank[own], owners, len(first), len(first) < len(names))
 
     def with_room(self, owners: int, distinct: int) -> Sharing:
-        """The same items, with room for more unknowns and owners, which have no items. Owners that are not there are
-        out of range."""
+        """The same items, with room for more unknowns and owners, which have no items. Owners that
+        are not there are out of range."""
         missing = np.full(owners - len(self.owners), distinct, np.int32)
         return replace(self, owners=np.append(self.owners, missing), distinct=distinct)
 
@@ -69,12 +72,13 @@ class Sharing(ArrayRecord):
         return rows / self.sums(jnp.ones((len(rows), *[1] * (rows.ndim - 1)), rows.dtype))
 
     def mean(self, rows: Float[Array, "items ..."]) -> Float[Array, "items ..."]:
-        """For each item the mean over those that are the same: the orthogonal projection on the range of T."""
+        """For each item the mean over those that are the same: the orthogonal projection on the
+        range of T."""
         return self.shares(self.sums(rows))
 
     def merged(self, lower: Float[Array, "items items"]) -> Float[Array, "distinct distinct"]:
-        """`T^T M T` of a symmetric M of which only the lower triangle is read. Unknowns without items have a unit
-        row."""
+        """`T^T M T` of a symmetric M of which only the lower triangle is read. Unknowns without
+        items have a unit row."""
         if not self.several:
             return lower
         matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
@@ -84,7 +88,8 @@ class Sharing(ArrayRecord):
 
     @staticmethod
     def joined(*parts: tuple[Sharing, int]) -> Sharing:
-        """That of numbers of items, flattened: for each item those of the first part, then those of the next."""
+        """That of numbers of items, flattened: for each item those of the first part, then those of
+        the next."""
         columns, end = [], 0
         for part, size in parts:
             columns.append(end + jnp.asarray(part.index)[:, None] * size + jnp.arange(size))
@@ -99,7 +104,8 @@ class Mask(ArrayRecord):
     """Where something holds."""
 
     values: Bool[AnyArray, "..."]
-    everywhere: bool = field(metadata={"static": True})  # whether it holds everywhere, so that there is nothing to do
+    # whether it holds everywhere, so that there is nothing to do
+    everywhere: bool = field(metadata={"static": True})
 
     @classmethod
     def of(cls, values: Bool[np.ndarray, "..."]) -> Mask:

@@ -1,4 +1,5 @@
-"""Assignment of observations to slots: buckets of points by track length, or chunks of a fixed capacity.
+"""Assignment of observations to slots: buckets of points by track length, or chunks of a fixed
+capacity.
 
 The track length of a point is its number of observations. Slots of a bucket are arranged in tiles
 (structure/layout.py)."""
@@ -14,16 +15,21 @@ from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.padding import POINT_CHUNK, Capacity, room_for
 from jaxba.structure.sum_trees import prefix_levels
 
-MAX_PADDING = 0.10  # largest number of empty slots relative to observations, besides one point of padding
+# largest number of empty slots relative to observations, besides one point of padding
+MAX_PADDING = 0.10
 
 TILE = 8
-"""Points per tile of a large bucket, as many as the widest vector registers hold. Without tiles a pass took twice as
-long: it reads a memory stream per observation of a point, a whole bucket apart, too many for prefetcher and TLB."""
+"""Points per tile of a large bucket, as many as the widest vector registers hold. Without tiles a
+pass took twice as long: it reads a memory stream per observation of a point, a whole bucket apart,
+too many for prefetcher and TLB."""
 
-TILED_POINTS = 512  # smaller buckets are a single tile: they fit the cache, and need no padding to a multiple of `TILE`
-_MAX_BUCKET_PADDING = (1 + MAX_PADDING) / (1 + (TILE - 1) / TILED_POINTS) - 1  # what padding to tiles leaves
+# smaller buckets are a single tile: they fit the cache, and need no padding to a multiple of `TILE`
+TILED_POINTS = 512
+# what padding to tiles leaves
+_MAX_BUCKET_PADDING = (1 + MAX_PADDING) / (1 + (TILE - 1) / TILED_POINTS) - 1
 Bucket = tuple[int, int, int]  # number of tiles, slots per point, points per tile
-PENALTY_FACTOR = 0.8  # factor between the penalties per bucket that are tried, until the padding is small enough
+# factor between the penalties per bucket that are tried, until the padding is small enough
+PENALTY_FACTOR = 0.8
 PENALTIES = 16  # number of penalties that are tried at once
 
 
@@ -39,11 +45,17 @@ class Slots(NamedTuple):
 
 
 def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALONE) -> Slots:
-    """Puts points of similar track length into buckets of shape `tiles x t x n`. Observations are sorted by point, and
-    `tracks` are their numbers. The other shards of a problem (`agreement`) have the same buckets."""
+    """Puts points of similar track length into buckets of shape `tiles x t x n`. Observations are
+    sorted by point, and `tracks` are their numbers. The other shards of a problem (`agreement`)
+    have the same buckets."""
     values = agreement.union("track lengths", 1 + np.flatnonzero(np.bincount(tracks)[1:]))
     own = np.bincount(tracks, minlength=int(values.max(initial=0)) + 1)[values]
-    counts = np.array([agreement.size(f"points of {length}", int(n)) for length, n in zip(values, own, strict=True)])
+    counts = np.array(
+        [
+            agreement.size(f"points of {length}", int(n))
+            for length, n in zip(values, own, strict=True)
+        ]
+    )
     lengths = _bucket_lengths(values, counts)
     which = np.searchsorted(lengths, tracks)
     column = np.zeros(len(tracks), np.int64)  # index of a point in its bucket
@@ -68,10 +80,12 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALON
         columns += tiles * tile
     tile = np.array([tile for _, _, tile in buckets])[which]
     before, within = np.divmod(column, tile)
-    first = np.array(offsets)[which] + before * lengths[which] * tile + within  # slot of each point's first observation
+    # slot of each point's first observation
+    first = np.array(offsets)[which] + before * lengths[which] * tile + within
     start = np.cumsum(tracks) - tracks
     return Slots(
-        slot=np.repeat(first - start * tile, tracks) + np.arange(int(tracks.sum())) * np.repeat(tile, tracks),
+        slot=np.repeat(first - start * tile, tracks)
+        + np.arange(int(tracks.sum())) * np.repeat(tile, tracks),
         point=np.concatenate(slot_point),
         points=np.concatenate(bucket_points),
         buckets=tuple(buckets),
@@ -81,11 +95,12 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALON
 
 
 def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slots:
-    """Puts points by descending track length into chunks of `POINT_CHUNK` slots, up to the capacity.
+    """Puts points by descending track length into chunks of `POINT_CHUNK` slots, up to the
+    capacity.
 
-    The c-th chunk has slots c, c + chunks, ..., so that the sums of all chunks are dense. First come the first chunks
-    of all points, then the second chunks of those that have one, and so on. Observations are sorted by point, and
-    `tracks` are their numbers."""
+    The c-th chunk has slots c, c + chunks, ..., so that the sums of all chunks are dense. First
+    come the first chunks of all points, then the second chunks of those that have one, and so on.
+    Observations are sorted by point, and `tracks` are their numbers."""
     order = np.argsort(-tracks, kind="stable")[: np.count_nonzero(tracks)]
     members = np.full(capacity.points, capacity.points, np.int32)
     members[: len(order)] = order
@@ -118,12 +133,12 @@ def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slot
 
 
 def _bucket_lengths(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Largest track length of each bucket, for few buckets with little padding; from track lengths, ascending, and the
-    number of points of each.
+    """Largest track length of each bucket, for few buckets with little padding; from track lengths,
+    ascending, and the number of points of each.
 
-    Every bucket adds to the size of the compiled program, so that their number is penalised: dynamic programming over
-    the distinct lengths minimises `slots + penalty * buckets`, for penalties that are lowered until the padding is
-    within `_MAX_BUCKET_PADDING`."""
+    Every bucket adds to the size of the compiled program, so that their number is penalised:
+    dynamic programming over the distinct lengths minimises `slots + penalty * buckets`, for
+    penalties that are lowered until the padding is within `_MAX_BUCKET_PADDING`."""
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
     # slots of a bucket, by its last and first length

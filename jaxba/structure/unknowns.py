@@ -1,16 +1,19 @@
-"""What is unknown: the numbers of cameras and points that a solve moves, and which cameras share theirs.
+"""What is unknown: the numbers of cameras and points that a solve moves, and which cameras share
+theirs.
 
-Every camera has a block of unknowns: six of its pose, and those numbers of its lens that some lens optimises
-(`columns`). What is constant has zero columns in the Jacobian; its gradient, and so its step, is then exactly zero.
+Every camera has a block of unknowns: six of its pose, and those numbers of its lens that some lens
+optimises (`columns`). What is constant has zero columns in the Jacobian; its gradient, and so its
+step, is then exactly zero.
 
-Let T be the matrix that copies the parameters y of shared lenses (and the poses) to the cameras, `d = T y`. The damped
-system `(H + D) d = -g` becomes
+Let T be the matrix that copies the parameters y of shared lenses (and the poses) to the cameras, `d
+= T y`. The damped system `(H + D) d = -g` becomes
 
     T^T (H + D) T y = -T^T g.
 
-T leaves points alone, so they are eliminated as usual. A factorisation has the shared lenses as a border of the reduced
-camera system S (linear/border.py). Conjugate gradients work on S itself, between projections on the range of T: with
-the orthogonal projector P, which averages over the cameras of a lens,
+T leaves points alone, so they are eliminated as usual. A factorisation has the shared lenses as a
+border of the reduced camera system S (linear/border.py). Conjugate gradients work on S itself,
+between projections on the range of T: with the orthogonal projector P, which averages over the
+cameras of a lens,
 
     P S P d = P b    has the solution    d = T y."""
 
@@ -42,21 +45,27 @@ NO_LENS = -1  # name of the lens of cameras without observations, in a padded la
 @register_pytree
 @dataclass(frozen=True, eq=False, repr=False)
 class Unknowns(ArrayRecord):
-    """The unknowns of a problem: of cameras and points, which are optimised, and which are the same."""
+    """The unknowns of a problem: of cameras and points, which are optimised, and which are the
+    same."""
 
     poses: Sharing  # cameras that move together: those of a frame
     lenses: Sharing  # observed cameras that have a lens in common of which something is optimised
-    own: tuple[Sharing, ...]  # of each block of residuals of one's own, which cameras have a row of it in common
+    # of each block of residuals of one's own, which cameras have a row of it in common
+    own: tuple[Sharing, ...]
     free: Mask  # which unknowns of each camera's block are optimised, [width, cameras]
     free_points: Mask  # which points are optimised, in layout order
     model: Int[AnyArray, " cameras"]  # camera model of each camera, a position in `models`
     models: tuple[CameraModel, ...] = field(metadata={"static": True})  # camera models
-    all_shared: bool = field(metadata={"static": True})  # whether every observed camera shares a lens with others
-    # numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block, ascending
+    # whether every observed camera shares a lens with others
+    all_shared: bool = field(metadata={"static": True})
+    # numbers of a lens, of extrinsics and of blocks of residuals that are part of a camera's block,
+    # ascending
     columns: tuple[int, ...] = field(metadata={"static": True})
     lens_size: int = field(metadata={"static": True})  # number of all intrinsics of a camera
-    own_sizes: tuple[int, ...] = field(metadata={"static": True})  # numbers of these blocks, the last ones of a camera
-    in_rigs: bool = field(metadata={"static": True})  # whether poses are those of frames, extrinsics the last numbers
+    # numbers of these blocks, the last ones of a camera
+    own_sizes: tuple[int, ...] = field(metadata={"static": True})
+    # whether poses are those of frames, extrinsics the last numbers
+    in_rigs: bool = field(metadata={"static": True})
 
     @property
     def places(self) -> tuple[int, ...]:
@@ -65,7 +74,8 @@ class Unknowns(ArrayRecord):
 
     @property
     def size(self) -> int:
-        """Number of all intrinsics of a camera, of its extrinsics if it is in a rig, and of blocks of residuals."""
+        """Number of all intrinsics of a camera, of its extrinsics if it is in a rig, and of blocks
+        of residuals."""
         return self.lens_size + EXTRINSICS_SIZE * self.in_rigs + sum(self.own_sizes)
 
     @property
@@ -75,7 +85,8 @@ class Unknowns(ArrayRecord):
 
     @property
     def merged(self) -> bool:
-        """Whether a factorisation merges rows and columns of what is shared, and has no lenses as a border."""
+        """Whether a factorisation merges rows and columns of what is shared, and has no lenses as a
+        border."""
         return self.poses.several or (self.shared and bool(self.own))
 
     @property
@@ -116,10 +127,13 @@ class Unknowns(ArrayRecord):
         return self._each("mean", self.free.where(x.T, 0).T)
 
     def constant(self, intrinsics: Intrinsics, *, alone: bool) -> tuple[bool, ...]:
-        """Which columns of the blocks are constant for all cameras: with `fixed` intrinsics all of these; where cameras
-        are optimised `alone`, one by one, what some of them share."""
+        """Which columns of the blocks are constant for all cameras: with `fixed` intrinsics all of
+        these; where cameras are optimised `alone`, one by one, what some of them share."""
         together = [alone and sharing.several for sharing, size in self.parts for _ in range(size)]
-        fixed = [*[False] * POSE_SIZE, *(intrinsics == "fixed" and column < self.lens_size for column in self.columns)]
+        fixed = [
+            *[False] * POSE_SIZE,
+            *(intrinsics == "fixed" and column < self.lens_size for column in self.columns),
+        ]
         return tuple(one or other for one, other in zip(together, fixed, strict=True))
 
     def restricted(
@@ -135,7 +149,10 @@ class Unknowns(ArrayRecord):
         """A step of camera blocks, with zeros for the numbers that are not part of them."""
         if len(self.columns) == self.size:
             return step
-        zero, place = jnp.zeros_like(step[0]), {column: POSE_SIZE + k for k, column in enumerate(self.columns)}
+        zero, place = (
+            jnp.zeros_like(step[0]),
+            {column: POSE_SIZE + k for k, column in enumerate(self.columns)},
+        )
         lens = [step[place[k]] if k in place else zero for k in range(self.size)]
         return jnp.concatenate([step[:POSE_SIZE], jnp.stack(lens)])
 
@@ -149,10 +166,11 @@ def unknowns_of(
     agreement: Agreement,
     capacity: Capacity | None = None,
 ) -> Unknowns:
-    """The unknowns of a problem, for its layout. The problem is `in_frames` if it has rigs. `seen`: whether each camera
-    has an observation; padding cameras have none. `order`: point of the problem at each position in layout order; out
-    of range for padding. `fixed`: whether all intrinsics are constant. Some points of other shards may be constant
-    (`agreement`). `capacity`: of a padded layout, whose shapes do not depend on what is constant and shared."""
+    """The unknowns of a problem, for its layout. The problem is `in_frames` if it has rigs. `seen`:
+    whether each camera has an observation; padding cameras have none. `order`: point of the problem
+    at each position in layout order; out of range for padding. `fixed`: whether all intrinsics are
+    constant. Some points of other shards may be constant (`agreement`). `capacity`: of a padded
+    layout, whose shapes do not depend on what is constant and shared."""
     cameras, points = len(problem.cameras), len(problem.points)
     lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
     padding, index = len(seen) - cameras, np.asarray(lenses.index)
@@ -161,16 +179,24 @@ def unknowns_of(
     own_free = np.ones((cameras, sum(own_sizes)), bool)
     # something may be constant in another problem of this shape
     may_hold = bool(capacity and (problem.lenses or problem.constants))
-    lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:], own_free])
+    lens_free = np.hstack(
+        [np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:], own_free]
+    )
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
     free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
     free = np.pad(free, ((0, padding), (0, 0)), constant_values=True)
-    held = np.zeros(points, bool) if problem.constants is None else np.asarray(problem.constants.points)
+    held = (
+        np.zeros(points, bool)
+        if problem.constants is None
+        else np.asarray(problem.constants.points)
+    )
     any_held = agreement.size("constant points", int(held.any()))
     apart = -1 - np.arange(len(seen))  # names of cameras that have nothing in common
     padded = lambda names: np.where(seen, np.pad(names, (0, padding)), apart)
     lens_room = capacity.lenses if capacity else 0
-    lens_names = padded(index) if not lens_room else np.where(seen, np.pad(index, (0, padding)), NO_LENS)
+    lens_names = (
+        padded(index) if not lens_room else np.where(seen, np.pad(index, (0, padding)), NO_LENS)
+    )
     shares = Sharing.of(lens_names)
     all_shared = bool(np.isin(shares.index, shares.owners)[seen].all())
     if lens_room:
@@ -182,7 +208,9 @@ def unknowns_of(
         lenses=shares if len(columns) > sum(own_sizes) else Sharing.of(apart),
         own=tuple(Sharing.of(padded(group)) for group in block_groups(problem)),
         free=Mask(free.T, bool(free.all()) and not may_hold),
-        free_points=Mask(np.append(~held, True)[np.minimum(order, points)], not (any_held or may_hold)),
+        free_points=Mask(
+            np.append(~held, True)[np.minimum(order, points)], not (any_held or may_hold)
+        ),
         model=np.pad(model, (0, padding)),
         models=lenses.models,
         all_shared=all_shared,
@@ -201,14 +229,17 @@ def _frames(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
         bad = np.flatnonzero(held.any(axis=1) & ~held.all(axis=1) & problem.rigs.turned)
         if bad.size:
             name = part_name(problem.labels, "image", int(bad[0]))
-            raise ProblemError(f"part of the translation of {name} is constant, which is turned in its rig")
+            raise ProblemError(
+                f"part of the translation of {name} is constant, which is turned in its rig"
+            )
     return np.asarray(problem.rigs.frame)
 
 
 NONE_SHARED = Sharing.of(np.zeros(0, np.int32))
 ALL_FREE = Mask(np.zeros(0, bool), True)
 
-BAL_UNKNOWNS = Unknowns(  # those of BAL cameras, all of whose numbers are optimised, however many there are
+# those of BAL cameras, all of whose numbers are optimised, however many there are
+BAL_UNKNOWNS = Unknowns(
     poses=NONE_SHARED,
     lenses=NONE_SHARED,
     own=(),

@@ -1,6 +1,7 @@
 """Checkpoints: a tree of arrays and JSON metadata in one `.npz` file, written atomically.
 
-A tree is a flat mapping from paths to NumPy arrays; restored leaves must have the expected shape and type."""
+A tree is a flat mapping from paths to NumPy arrays; restored leaves must have the expected shape
+and type."""
 
 from __future__ import annotations
 
@@ -23,22 +24,28 @@ _METADATA = "metadata"
 
 
 class TrainError(InputError):
-    """A run that cannot start or continue, or an unusable checkpoint. The message is one line for a person."""
+    """A run that cannot start or continue, or an unusable checkpoint. The message is one line for a
+    person."""
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
     """Leaves of a tree by path, copied to the host; random keys as arrays."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {_name(path): np.array(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
+    return {
+        _name(path): np.array(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves
+    }
 
 
 def check(arrays: Mapping[str, Any], like: Any) -> None:
-    """Compares leaves by path (`pack`) with a tree of the expected structure, of arrays or of `jax.ShapeDtypeStruct`.
-    Raises TrainError: a leaf is missing, or is of another shape or type."""
+    """Compares leaves by path (`pack`) with a tree of the expected structure, of arrays or of
+    `jax.ShapeDtypeStruct`. Raises TrainError: a leaf is missing, or is of another shape or type."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(like)[0]:
         if (name := _name(path)) not in arrays:
             raise TrainError(f"{name} is missing")
-        value, expected = arrays[name], jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+        value, expected = (
+            arrays[name],
+            jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf,
+        )
         if (value.shape, value.dtype) != (expected.shape, expected.dtype):
             found, wanted = (f"{x.dtype}{list(x.shape)}" for x in (value, expected))
             raise TrainError(f"{name} is {found}, not {wanted}")
@@ -49,7 +56,8 @@ def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
     check(arrays, like)
 
     def leaf(path: Any, expected: Any) -> Any:
-        value = jnp.array(arrays[_name(path)], copy=True)  # a copy, since training donates its argument
+        # a copy, since training donates its argument
+        value = jnp.array(arrays[_name(path)], copy=True)
         return jax.random.wrap_key_data(value) if _is_key(expected) else value
 
     return jax.tree_util.tree_map_with_path(leaf, like)
@@ -70,12 +78,14 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file, in its order. Raises TrainError: it is damaged. Raises OSError: not opened."""
+    """All arrays of an `.npz` file, in its order. Raises TrainError: it is damaged. Raises OSError:
+    not opened."""
     with path.open("rb") as stream:
         try:
             with np.load(stream) as file:
                 return dict(file)
-        except Exception:  # zipfile and NumPy name no set of errors for damaged files; checksums tell the rest
+        # zipfile and NumPy name no set of errors for damaged files; checksums tell the rest
+        except Exception:
             raise TrainError("damaged") from None
 
 
@@ -87,26 +97,47 @@ def steps(folder: Path) -> list[int]:
     """Numbers of the complete checkpoints in a folder, in order."""
     if not folder.is_dir():
         return []
-    names = [item.name.removesuffix(_SUFFIX) for item in folder.iterdir() if item.name.startswith(_PREFIX)]
-    return sorted({int(number) for name in names if (number := name.removeprefix(_PREFIX)).isdigit()})
+    names = [
+        item.name.removesuffix(_SUFFIX)
+        for item in folder.iterdir()
+        if item.name.startswith(_PREFIX)
+    ]
+    return sorted(
+        {int(number) for name in names if (number := name.removeprefix(_PREFIX)).isdigit()}
+    )
 
 
-def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
-    """Writes a checkpoint, over an old one of the same number, then removes all but the last `keep` up to it, this one
-    included, and incomplete ones of a killed process. The folder is created if missing; metadata are JSON. Raises
-    TrainError: it cannot be written; those before are still there. Raises OSError: the folder cannot be created."""
+def save(
+    folder: Path,
+    step: int,
+    arrays: Mapping[str, np.ndarray],
+    metadata: Mapping[str, Any],
+    keep: int,
+) -> None:
+    """Writes a checkpoint, over an old one of the same number, then removes all but the last `keep`
+    up to it, this one included, and incomplete ones of a killed process. The folder is created if
+    missing; metadata are JSON. Raises TrainError: it cannot be written; those before are still
+    there. Raises OSError: the folder cannot be created."""
     folder.mkdir(parents=True, exist_ok=True)
     path = _path(folder, step)
     if path.is_dir():  # no checkpoint, and in the way of one
         shutil.rmtree(path, ignore_errors=True)
     try:
-        write_arrays(path, {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)})
+        write_arrays(
+            path, {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
+        )
     except OSError as error:
         raise TrainError(f"{path} cannot be written: {error.strerror or error}") from None
-    kept = {_path(folder, number).name for number in [n for n in steps(folder) if n <= step][-keep:]}
+    kept = {
+        _path(folder, number).name for number in [n for n in steps(folder) if n <= step][-keep:]
+    }
     for item in folder.iterdir():
-        if item.name not in kept and (item.name.startswith(_PREFIX) or fnmatch(item.name, TEMPORARY.format("*"))):
-            shutil.rmtree(item, ignore_errors=True) if item.is_dir() else item.unlink(missing_ok=True)
+        if item.name not in kept and (
+            item.name.startswith(_PREFIX) or fnmatch(item.name, TEMPORARY.format("*"))
+        ):
+            shutil.rmtree(item, ignore_errors=True) if item.is_dir() else item.unlink(
+                missing_ok=True
+            )
 
 
 def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

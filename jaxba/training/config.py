@@ -1,7 +1,7 @@
 """The configuration of a training run, and the YAML files that hold it.
 
-A file in `configs/train` lists differences to the file that it extends, or to the defaults of the classes
-(jaxba/settings/configurations.py); a run writes all settings into its folder."""
+A file in `configs/train` lists differences to the file that it extends, or to the defaults of the
+classes (jaxba/settings/configurations.py); a run writes all settings into its folder."""
 
 from __future__ import annotations
 
@@ -24,9 +24,13 @@ from jaxba.training.train_loop import LoopConfig
 
 MethodName = Literal["lm", "stba", "deeplm"]
 
-CLUSTER_CAMERAS = 4  # most cameras in a cluster: the default of methods is too large for scenes of the game
-CG_ROUNDS = 2  # iterations of `cg` per camera unknown: predicted decrease within 1e-10, 10 x 10 scenes, lambda 1e-10
-METADATA_BYTES = 1 << 14  # reserved for the metadata of a policy file, of which the configuration takes 3 kB
+# most cameras in a cluster: the default of methods is too large for scenes of the game
+CLUSTER_CAMERAS = 4
+# iterations of `cg` per camera unknown: predicted decrease within 1e-10, 10 x 10 scenes, lambda
+# 1e-10
+CG_ROUNDS = 2
+# reserved for the metadata of a policy file, of which the configuration takes 3 kB
+METADATA_BYTES = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -37,24 +41,27 @@ class TrainConfig:
     """Of all random numbers: the scenes, and with the number of an agent its training."""
 
     seeds: int = 1
-    """Agents trained side by side on the same scenes, in one program. Their replay buffers are held at once."""
+    """Agents trained side by side on the same scenes, in one program. Their replay buffers are held
+    at once."""
 
     chunks: int = 40
-    """Length of each agent's training in calls of the compiled loop, each of `loop.steps_per_chunk` vector steps."""
+    """Length of each agent's training in calls of the compiled loop, each of `loop.steps_per_chunk`
+    vector steps."""
 
     evaluate_every: int = 4
-    """Chunks between evaluations, each followed by a checkpoint, of which the last two are kept; the last chunk has
-    both. A checkpoint also holds the best policy so far."""
+    """Chunks between evaluations, each followed by a checkpoint, of which the last two are kept;
+    the last chunk has both. A checkpoint also holds the best policy so far."""
 
     envs: int = 64
     """Environments that step together."""
 
     method: MethodName = "lm"
-    """How a step is computed (jaxba/solver/methods.py). Scenes are solved and selected with plain LM."""
+    """How a step is computed (jaxba/solver/methods.py). Scenes are solved and selected with plain
+    LM."""
 
     linear_solver: Literal["explicit", "cg"] = "explicit"
-    """Linear solver of the game's steps: `explicit`: a factorisation; `cg`: `jax.scipy.sparse.linalg.cg`, to the
-    accuracy of one. Methods other than `lm` have their own."""
+    """Linear solver of the game's steps: `explicit`: a factorisation; `cg`:
+    `jax.scipy.sparse.linalg.cg`, to the accuracy of one. Methods other than `lm` have their own."""
 
     bank: BankConfig = field(default_factory=BankConfig)
     """Scenes."""
@@ -114,15 +121,17 @@ def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
         raise ValueError(
-            f"sac.width {sac.width} with sac.layers {sac.policy_layers} makes a policy of {4 * numbers} bytes, "
+            f"sac.width {sac.width} with sac.layers {sac.policy_layers} makes a policy of "
+            f"{4 * numbers} bytes, "
             f"more than the {LARGEST_FILE - METADATA_BYTES} of a policy file"
         )
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
-    """The configuration of a preset, or of a YAML file by its path: anything with a slash or an ending. `overrides` are
-    `key.key=value` each, the value in YAML; they override the file. Raises SettingsError: no such file or base, not
-    YAML, an unknown key or an impossible value; one line."""
+    """The configuration of a preset, or of a YAML file by its path: anything with a slash or an
+    ending. `overrides` are `key.key=value` each, the value in YAML; they override the file. Raises
+    SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one
+    line."""
     data = configurations.read("train", name)
     for override in overrides:
         if not isinstance(override, str):
@@ -131,7 +140,9 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
         if not equals or not key:
             raise SettingsError(f"--set {override}: must be key=value")
         try:
-            settings.assign(data, key.strip(), configurations.parse(value, "the value"), TrainConfig)
+            settings.assign(
+                data, key.strip(), configurations.parse(value, "the value"), TrainConfig
+            )
         except SettingsError as error:
             raise SettingsError(f"--set {override}: {error}") from None
     try:

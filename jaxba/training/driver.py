@@ -1,8 +1,10 @@
-"""The training driver: compiled chunks, evaluations between them, checkpoints, and bitwise identical resuming.
+"""The training driver: compiled chunks, evaluations between them, checkpoints, and bitwise
+identical resuming.
 
-A run has a folder with `config.yaml`, `metrics.jsonl` and `checkpoints/`. A checkpoint holds the loop's state, the best
-policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that can be read,
-removes from the log what was written after it, and repeats that, with the same numbers.
+A run has a folder with `config.yaml`, `metrics.jsonl` and `checkpoints/`. A checkpoint holds the
+loop's state, the best policy of every agent so far, and its score. A run that is resumed goes on
+from the last checkpoint that can be read, removes from the log what was written after it, and
+repeats that, with the same numbers.
 
 All agents of a run are trained side by side, in one program over an axis of agents."""
 
@@ -65,22 +67,28 @@ class Hooks:
     """Callbacks of a run."""
 
     stage: Callable[[str], None] = lambda _: None  # gets a line of text when something long begins
-    rows: Callable[[list[Row]], None] = lambda _: None  # gets the rows of a chunk, one of every agent
-    best: Callable[[tuple[Best, ...]], None] = lambda _: None  # gets the best policies of all agents when one is new
-    stop: Callable[[], bool] = lambda: False  # asked after each chunk: if true, the run is saved and ends
+    # gets the rows of a chunk, one of every agent
+    rows: Callable[[list[Row]], None] = lambda _: None
+    # gets the best policies of all agents when one is new
+    best: Callable[[tuple[Best, ...]], None] = lambda _: None
+    # asked after each chunk: if true, the run is saved and ends
+    stop: Callable[[], bool] = lambda: False
     note: Callable[[str], None] = lambda _: None  # gets a line of text on damaged files
 
 
 def prepare_folder(
     folder: Path, config: TrainConfig | None, resume: bool, overrides: tuple[str, ...] = ()
 ) -> TrainConfig:
-    """Creates the folder of a new run, or reads the configuration of the run to resume. For a resumed run, `config`
-    None is the configuration in its folder, and `overrides` change that by `key=value`. Raises TrainError: a new run
-    would overwrite another one, there is no run to resume, or its configuration differs. Raises SettingsError: the
-    configuration in the folder cannot be read."""
+    """Creates the folder of a new run, or reads the configuration of the run to resume. For a
+    resumed run, `config` None is the configuration in its folder, and `overrides` change that by
+    `key=value`. Raises TrainError: a new run would overwrite another one, there is no run to
+    resume, or its configuration differs. Raises SettingsError: the configuration in the folder
+    cannot be read."""
     path = folder / CONFIG
     if path.is_file() and not resume and _others(folder):
-        raise TrainError(f"{folder} holds a run already; --resume goes on with it, --out names another folder")
+        raise TrainError(
+            f"{folder} holds a run already; --resume goes on with it, --out names another folder"
+        )
     if resume:
         if not path.is_file():
             raise TrainError(f"{folder} holds no run to resume")
@@ -88,7 +96,10 @@ def prepare_folder(
         new = config or load(str(path), overrides)
         changed = [key for key in settings.differences(old, new) if key != CHANGEABLE]
         if changed:
-            raise TrainError(f"{folder} was begun with another {changed[0]}; a resumed run may change {CHANGEABLE}")
+            raise TrainError(
+                f"{folder} was begun with another {changed[0]}; a resumed run may change "
+                f"{CHANGEABLE}"
+            )
         config = new
     if config is None:
         raise AssertionError("a new run needs a configuration")
@@ -109,7 +120,8 @@ def _others(folder: Path) -> bool:
 
 @for_traces
 def begin_compiling(config: TrainConfig, env: Any) -> Future[Any]:
-    """Compiles the training loop in another thread: XLA compiles one program on little more than one core."""
+    """Compiles the training loop in another thread: XLA compiles one program on little more than
+    one core."""
     lowered = run_agents.lower(config.sac, config.loop, env, _shapes(config, env))
     other = ThreadPoolExecutor(1)
     compiled = other.submit(lowered.compile)
@@ -119,7 +131,9 @@ def begin_compiling(config: TrainConfig, env: Any) -> Future[Any]:
 
 def _keys(config: TrainConfig) -> Any:
     """Random keys of the agents; scenes have another one."""
-    return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(config.seed), 1 + jnp.arange(config.seeds))
+    return jax.vmap(jax.random.fold_in, (None, 0))(
+        jax.random.key(config.seed), 1 + jnp.arange(config.seeds)
+    )
 
 
 def _shapes(config: TrainConfig, env: Any) -> Any:
@@ -140,21 +154,31 @@ def train(
     Args:
         config: of the run; `bank` and `game` are not used.
         env: a `protocol.Environment`.
-        evaluate: metrics of an actor's parameters by their names in the log, deterministic; `SCORE` is one of them.
+        evaluate: metrics of an actor's parameters by their names in the log, deterministic; `SCORE`
+            is one of them.
         folder: see `prepare_folder`.
         hooks: callbacks.
         loop: of `begin_compiling`; None: it is called now.
 
     Raises:
-        TrainError: losses or all transitions are not finite, or no checkpoint can be used or written."""
-    return _Run(config, env, evaluate, folder, hooks or Hooks(), loop or begin_compiling(config, env)).finish()
+        TrainError: losses or all transitions are not finite, or no checkpoint can be used or
+            written."""
+    return _Run(
+        config, env, evaluate, folder, hooks or Hooks(), loop or begin_compiling(config, env)
+    ).finish()
 
 
 class _Run:
     """A run between two chunks."""
 
     def __init__(
-        self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks, loop: Future[Any]
+        self,
+        config: TrainConfig,
+        env: Any,
+        evaluate: Any,
+        folder: Path,
+        hooks: Hooks,
+        loop: Future[Any],
     ) -> None:
         self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
         self.log, self.folder = folder, folder / CHECKPOINTS
@@ -167,14 +191,16 @@ class _Run:
             self._restore_latest(like)
         else:
             fresh = start_agents(config.sac, config.loop, env, _keys(config))
-            self.state: LoopState = checkpoint.unpack(checkpoint.pack(fresh), like)  # laid out as after a checkpoint
+            # laid out as after a checkpoint
+            self.state: LoopState = checkpoint.unpack(checkpoint.pack(fresh), like)
         evaluate(_agent(self.state.learner.actor, 0))  # compiles its programs
         self._compiled = loop.result()
         log.begin(folder, self.chunk, hooks.note)
         hooks.stage("training")
 
     def _restore_latest(self, like: Any) -> None:
-        """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
+        """Restores the last checkpoint that can be used; one that was cut short says nothing about
+        those before."""
         reasons = []
         for step in reversed(checkpoint.steps(self.folder)):
             try:
@@ -183,10 +209,14 @@ class _Run:
                 reasons.append(str(error))
                 continue
             if reasons:
-                self.hooks.note(f"{reasons[0]}; going on from the one before, after chunk {self.chunk}")
+                self.hooks.note(
+                    f"{reasons[0]}; going on from the one before, after chunk {self.chunk}"
+                )
             return
         others = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
-        raise TrainError(f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder")
+        raise TrainError(
+            f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder"
+        )
 
     def _restore(self, step: int, like: Any) -> None:
         arrays, metadata = checkpoint.restore(self.folder, step)
@@ -197,7 +227,9 @@ class _Run:
             raise TrainError(f"checkpoint {step} was written by another version: {error}") from None
         self.state = checkpoint.unpack(arrays, {"state": like})["state"]
         if found:
-            host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
+            host = jax.tree.map(
+                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor
+            )
             actors = checkpoint.unpack(arrays, {"best": host})["best"]
             self.best = tuple(one._replace(actor=_agent(actors, one.agent)) for one in found)
 
@@ -207,7 +239,9 @@ class _Run:
             actors = jax.tree.map(lambda *x: jnp.stack(x), *(one.actor for one in self.best))
             arrays = {**checkpoint.pack({"best": actors}), **arrays}
         best = [{"score": one.score, "chunk": one.chunk} for one in self.best]
-        metadata: dict[str, Any] = dict(zip(_METADATA, (self.chunk, self.wall_s, self.evaluated, best), strict=True))
+        metadata: dict[str, Any] = dict(
+            zip(_METADATA, (self.chunk, self.wall_s, self.evaluated, best), strict=True)
+        )
         try:
             checkpoint.save(self.folder, self.chunk, arrays, metadata, KEPT)
         except TrainError as error:
@@ -233,7 +267,8 @@ class _Run:
         return [_agent(whole, k) for k in range(self.config.seeds)]
 
     def _advance(self) -> bool:
-        """One chunk, its evaluation if one is due, and its rows of the log. Whether the run is to end."""
+        """One chunk, its evaluation if one is due, and its rows of the log. Whether the run is to
+        end."""
         before = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
         wall, cpu = time.perf_counter(), time.process_time()
         self.state, found = self._compiled(self.env, self.state)
@@ -241,21 +276,42 @@ class _Run:
         seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
         self.chunk += 1
         self.wall_s += seconds
-        bad = np.flatnonzero(~np.all([np.isfinite(means[x]) for x in ("critic_loss", "actor_loss", "q_mean")], axis=0))
+        bad = np.flatnonzero(
+            ~np.all(
+                [np.isfinite(means[x]) for x in ("critic_loss", "actor_loss", "q_mean")], axis=0
+            )
+        )
         if len(bad):
-            raise TrainError(f"chunk {self.chunk} of agent {bad[0] + 1}: the losses are not finite any more")
+            raise TrainError(
+                f"chunk {self.chunk} of agent {bad[0] + 1}: the losses are not finite any more"
+            )
         counts = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
         if np.any(means["dropped"] >= counts[0] - before[0]):
             raise TrainError(
-                f"chunk {self.chunk}: all transitions hold numbers that are not finite; look at the reward"
+                f"chunk {self.chunk}: all transitions hold numbers that are not finite; look at "
+                "the reward"
             )
-        steps, updates = (float(np.sum(new - old)) / seconds for new, old in zip(counts, before, strict=True))
-        clocks = {"wall_s": self.wall_s, "chunk_s": seconds, "steps_per_s": steps, "updates_per_s": updates}
+        steps, updates = (
+            float(np.sum(new - old)) / seconds for new, old in zip(counts, before, strict=True)
+        )
+        clocks = {
+            "wall_s": self.wall_s,
+            "chunk_s": seconds,
+            "steps_per_s": steps,
+            "updates_per_s": updates,
+        }
         clocks |= {"cpu_per_wall": cpu / seconds}
         rows: list[Row] = []
         for k in range(self.config.seeds):
-            row: Row = {"seed": k, "chunk": self.chunk, "env_steps": int(counts[0][k]), "updates": int(counts[1][k])}
-            rows.append({**row, **clocks, **{name: float(value[k]) for name, value in means.items()}})
+            row: Row = {
+                "seed": k,
+                "chunk": self.chunk,
+                "env_steps": int(counts[0][k]),
+                "updates": int(counts[1][k]),
+            }
+            rows.append(
+                {**row, **clocks, **{name: float(value[k]) for name, value in means.items()}}
+            )
         due = self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks
         if due:
             wall = time.perf_counter()
@@ -266,7 +322,8 @@ class _Run:
         return self.hooks.stop()
 
     def _evaluate(self, actors: list[Any]) -> list[dict[str, float]]:
-        """Metrics of every agent's policy, which is kept if it is better than all before of this agent."""
+        """Metrics of every agent's policy, which is kept if it is better than all before of this
+        agent."""
         found, best = [], []
         for k, actor in enumerate(actors):
             scores = {name: float(value) for name, value in self.evaluate(actor).items()}

@@ -1,4 +1,5 @@
-"""The log of a run: one JSON object per line (io/json_lines.py), a row of every agent after each chunk."""
+"""The log of a run: one JSON object per line (io/json_lines.py), a row of every agent after each
+chunk."""
 
 from __future__ import annotations
 
@@ -12,13 +13,15 @@ from jaxba.runtime.atomic import atomic_write
 
 FILE = "metrics.jsonl"
 
-ORDER = ("seed", "chunk", "updates")  # integers by which rows are ordered and drawn: every row has them
+# integers by which rows are ordered and drawn: every row has them
+ORDER = ("seed", "chunk", "updates")
 Row = dict[str, Any]  # metrics of one chunk by name; None if not finite
 
 
 def begin(folder: Path, chunk: int, report: Callable[[str], None]) -> None:
-    """Removes rows that a killed run wrote after its last checkpoint, the one after `chunk`, and damaged ones, of which
-    `report` gets a line of text. Raises OSError: the file cannot be read or written."""
+    """Removes rows that a killed run wrote after its last checkpoint, the one after `chunk`, and
+    damaged ones, of which `report` gets a line of text. Raises OSError: the file cannot be read or
+    written."""
     path = folder / FILE
     lines, damaged = _lines(path)
     kept = [line for line, row in lines if row["chunk"] <= chunk]
@@ -40,7 +43,8 @@ def read(folder: Path) -> list[Row]:
 
 
 def _lines(path: Path) -> tuple[list[tuple[bytes, Row]], int]:
-    """The lines that hold a row, with that row, and how many do not: cut short, or zeros after a power failure."""
+    """The lines that hold a row, with that row, and how many do not: cut short, or zeros after a
+    power failure."""
     found: list[tuple[bytes, Row]] = []
     lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
     for line in lines:
@@ -48,6 +52,10 @@ def _lines(path: Path) -> tuple[list[tuple[bytes, Row]], int]:
             row = json.loads(line)
         except ValueError:
             continue
-        if line.endswith(b"\n") and isinstance(row, dict) and all(isinstance(row.get(key), int) for key in ORDER):
+        if (
+            line.endswith(b"\n")
+            and isinstance(row, dict)
+            and all(isinstance(row.get(key), int) for key in ORDER)
+        ):
             found.append((line, row))
     return found, len(lines) - len(found)

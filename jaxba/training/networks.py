@@ -1,7 +1,8 @@
 """Networks of the agent and its distribution over actions. The only module that uses flax.
 
-Parameters are plain trees of float32 arrays, also with 64-bit JAX. Actions are in (-1, 1): `u = tanh(x)` with a normal
-`x`. Log-probabilities are those of `u`, so that the entropy does not depend on the scale of what an action means."""
+Parameters are plain trees of float32 arrays, also with 64-bit JAX. Actions are in (-1, 1): `u =
+tanh(x)` with a normal `x`. Log-probabilities are those of `u`, so that the entropy does not depend
+on the scale of what an action means."""
 
 from __future__ import annotations
 
@@ -15,9 +16,12 @@ from flax import linen as nn
 from jax import Array
 from jaxtyping import Float
 
-LAST_LAYER = 3e-3  # bound of uniform initial weights of last layers. Source: Lillicrap et al. 2016 (DDPG), section 7
-LOG_STD_MAX = 2.0  # upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code
-LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))  # the largest below one, to which tanh can round
+# bound of uniform initial weights of last layers. Source: Lillicrap et al. 2016 (DDPG), section 7
+LAST_LAYER = 3e-3
+# upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code
+LOG_STD_MAX = 2.0
+# the largest below one, to which tanh can round
+LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
 def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
@@ -27,8 +31,9 @@ def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
 class MLP(nn.Module):
     """Hidden layers of one width with ReLU, and a linear last layer with small initial weights.
 
-    With `layer_norm` each hidden layer is normalised before its ReLU, without learned scale and shift, which the next
-    layers have: an update of width 64 takes a tenth less time. Source: Ba et al. 2016; in critics Ball et al. 2023."""
+    With `layer_norm` each hidden layer is normalised before its ReLU, without learned scale and
+    shift, which the next layers have: an update of width 64 takes a tenth less time. Source: Ba et
+    al. 2016; in critics Ball et al. 2023."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -43,7 +48,9 @@ class MLP(nn.Module):
             if self.layer_norm:
                 x = nn.LayerNorm(dtype=jnp.float32, use_bias=False, use_scale=False)(x)
             x = nn.relu(x)
-        return nn.Dense(self.outputs, dtype=jnp.float32, param_dtype=jnp.float32, kernel_init=_small)(x)
+        return nn.Dense(
+            self.outputs, dtype=jnp.float32, param_dtype=jnp.float32, kernel_init=_small
+        )(x)
 
 
 class Value(nn.Module):
@@ -60,7 +67,8 @@ class Value(nn.Module):
 
 
 class Critic(nn.Module):
-    """An ensemble of values of an observation and an action. Their parameters are stacked along the first axis."""
+    """An ensemble of values of an observation and an action. Their parameters are stacked along the
+    first axis."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -87,8 +95,9 @@ class Critic(nn.Module):
 class Actor(nn.Module):
     """Mean and logarithm of the standard deviation of the pre-tanh action.
 
-    The logarithm is bounded by a sigmoid, whose gradient never vanishes as that of a clip does. It is zero where the
-    network's output is zero, so that an untrained policy is spread over all of (-1, 1)."""
+    The logarithm is bounded by a sigmoid, whose gradient never vanishes as that of a clip does. It
+    is zero where the network's output is zero, so that an untrained policy is spread over all of
+    (-1, 1)."""
 
     width: int  # units of a hidden layer
     layers: int  # hidden layers
@@ -103,7 +112,9 @@ class Actor(nn.Module):
         outputs = MLP(self.width, self.layers, 2 * self.actions)(observation)
         mean, raw = jnp.split(outputs, 2, axis=-1)
         span = LOG_STD_MAX - self.log_std_min
-        log_std = self.log_std_min + span * jax.nn.sigmoid(raw + math.log(-self.log_std_min / LOG_STD_MAX))
+        log_std = self.log_std_min + span * jax.nn.sigmoid(
+            raw + math.log(-self.log_std_min / LOG_STD_MAX)
+        )
         return mean, log_std
 
 
@@ -119,8 +130,9 @@ def log_probability(
 ) -> Float[Array, "*batch"]:
     """Log density of `u = tanh(x)`, nats, for `x = mean + exp(log_std) noise`.
 
-    `log N(x) - log(1 - u^2)` with `log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x))`, which neither overflows nor
-    cancels for large `x`. Source: Haarnoja et al. 2018, appendix C; the stable form is TensorFlow Probability's."""
+    `log N(x) - log(1 - u^2)` with `log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x))`, which
+    neither overflows nor cancels for large `x`. Source: Haarnoja et al. 2018, appendix C; the
+    stable form is TensorFlow Probability's."""
     normal = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
     log_det = 2 * (math.log(2) - pre_tanh - jax.nn.softplus(-2 * pre_tanh))
     return jnp.sum(normal - log_det, axis=-1)

@@ -1,7 +1,7 @@
 """Replay buffer: a ring buffer of transitions in one float32 array.
 
-Transitions with a number that is not finite are dropped. Replacing the number by zero would teach the critic a wrong
-value; a game that wants to penalise failures must give a finite reward."""
+Transitions with a number that is not finite are dropped. Replacing the number by zero would teach
+the critic a wrong value; a game that wants to penalise failures must give a finite reward."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class Transition(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """The buffer. Rows hold observation, action, next observation, reward and discount, in this order."""
+    """The buffer. Rows hold observation, action, next observation, reward and discount, in this
+    order."""
 
     rows: Float[Array, "capacity numbers"]
     action: Float[Array, " actions"]  # zeros; holds the size of an action
@@ -36,17 +37,21 @@ class Replay(NamedTuple):
 def init(capacity: int, observation_size: int, action_size: int) -> Replay:
     """An empty buffer; takes `4 capacity (2 observation_size + action_size + 2)` bytes."""
     rows = jnp.zeros((capacity, 2 * observation_size + action_size + 2), jnp.float32)
-    zero = lambda: jnp.zeros((), jnp.int32)  # separate arrays, since a buffer can be donated only once
+    # separate arrays, since a buffer can be donated only once
+    zero = lambda: jnp.zeros((), jnp.int32)
     return Replay(rows, jnp.zeros(action_size, jnp.float32), zero(), zero(), zero())
 
 
 def add(buffer: Replay, transitions: Transition) -> Replay:
-    """Writes a batch of transitions, over the oldest ones if the buffer is full. The buffer has a capacity of at least
-    the batch; transitions have one leading axis, and are of any floating point type."""
+    """Writes a batch of transitions, over the oldest ones if the buffer is full. The buffer has a
+    capacity of at least the batch; transitions have one leading axis, and are of any floating point
+    type."""
     capacity = buffer.rows.shape[0]
     columns = [jnp.asarray(x, jnp.float32) for x in transitions]
     observation, action, reward, next_observation, discount = columns
-    rows = jnp.concatenate([observation, action, next_observation, reward[:, None], discount[:, None]], axis=1)
+    rows = jnp.concatenate(
+        [observation, action, next_observation, reward[:, None], discount[:, None]], axis=1
+    )
     count = rows.shape[0]
     if count > capacity:
         raise ValueError(f"a batch of {count} transitions does not fit a buffer of {capacity}")

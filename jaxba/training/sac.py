@@ -1,9 +1,9 @@
 """Soft actor-critic in two forms, as pure functions of a learner and a batch.
 
-`twin` is Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications": two critics, target networks of both,
-a learned temperature. `value` is the form of the paper (Belder et al. 2023), that of Haarnoja et al. 2018,
-"Soft Actor-Critic: Off-Policy Maximum Entropy Deep RL": policy, two critics, a value network and its target network, a
-fixed temperature."""
+`twin` is Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications": two critics, target
+networks of both, a learned temperature. `value` is the form of the paper (Belder et al. 2023), that
+of Haarnoja et al. 2018, "Soft Actor-Critic: Off-Policy Maximum Entropy Deep RL": policy, two
+critics, a value network and its target network, a fixed temperature."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ class SacConfig:
     """Settings of the agent, by default chosen for a CPU. Hashable: static in compiled programs."""
 
     variant: Literal["twin", "value"] = "twin"
-    """`twin`: target critics, learned temperature. `value`: the paper's, with a value network and its target."""
+    """`twin`: target critics, learned temperature. `value`: the paper's, with a value network and
+    its target."""
 
     width: int = 64
-    """Units of a hidden layer. 64 is five times faster on a CPU than the paper's 256 (six without layer norm)."""
+    """Units of a hidden layer. 64 is five times faster on a CPU than the paper's 256 (six without
+    layer norm)."""
 
     layers: int = 2
     """Hidden layers of every network."""
@@ -46,7 +48,8 @@ class SacConfig:
     """Discount of a step."""
 
     tau: float = 0.005
-    """Fraction by which the target networks move towards the critics at each refresh. Source: Haarnoja et al. 2018."""
+    """Fraction by which the target networks move towards the critics at each refresh. Source:
+    Haarnoja et al. 2018."""
 
     target_every: int = 1
     """Updates between refreshes of the target networks."""
@@ -61,11 +64,13 @@ class SacConfig:
     """Whether the temperature is adapted to the target entropy; otherwise it is constant."""
 
     privileged: bool = True
-    """Whether critics see what the policy does not (`Environment.privileged_size`), an asymmetric actor-critic. Source:
-    Pinto et al. 2017, "Asymmetric Actor Critic for Image-Based Robot Learning"."""
+    """Whether critics see what the policy does not (`Environment.privileged_size`), an asymmetric
+    actor-critic. Source: Pinto et al. 2017, "Asymmetric Actor Critic for Image-Based Robot
+    Learning"."""
 
     target_entropy: float | None = None
-    """Nats, of the action in (-1, 1); if None, minus the numbers of an action. Source: Haarnoja et al. 2018."""
+    """Nats, of the action in (-1, 1); if None, minus the numbers of an action. Source: Haarnoja et
+    al. 2018."""
 
     log_std_min: float = -5.0
     """Lower bound of the log standard deviation before tanh."""
@@ -89,7 +94,8 @@ class Learner(NamedTuple):
     updates: Int[Array, ""]
 
 
-def _actor(config: SacConfig, actions: int) -> Any:  # flax types the outputs of its networks as anything or a pair
+# flax types the outputs of its networks as anything or a pair
+def _actor(config: SacConfig, actions: int) -> Any:
     return networks.Actor(config.width, config.policy_layers, actions, config.log_std_min)
 
 
@@ -101,11 +107,16 @@ def _value(config: SacConfig) -> Any:
     return networks.Value(config.width, config.layers, config.layer_norm)
 
 
-def init(config: SacConfig, key: Array, observation_size: int, action_size: int, privileged_size: int = 0) -> Learner:
-    """An untrained agent. The key is that of the parameters and of all later random numbers. The actor does not see the
-    last `privileged_size` features of an observation."""
+def init(
+    config: SacConfig, key: Array, observation_size: int, action_size: int, privileged_size: int = 0
+) -> Learner:
+    """An untrained agent. The key is that of the parameters and of all later random numbers. The
+    actor does not see the last `privileged_size` features of an observation."""
     key, actor_key, critic_key, value_key = jax.random.split(key, 4)
-    observation, action = jnp.zeros((1, observation_size), jnp.float32), jnp.zeros((1, action_size), jnp.float32)
+    observation, action = (
+        jnp.zeros((1, observation_size), jnp.float32),
+        jnp.zeros((1, action_size), jnp.float32),
+    )
     public = observation[:, : observation_size - privileged_size]
     observation = observation if config.privileged else public
     actor = _actor(config, action_size).init(actor_key, public)
@@ -121,7 +132,9 @@ def init(config: SacConfig, key: Array, observation_size: int, action_size: int,
         value=value,
         target=jax.tree.map(jnp.copy, critic if value is None else value),
         log_temperature=log_temperature,
-        optimizers={name: optax.adam(config.learning_rate).init(params) for name, params in trained.items()},
+        optimizers={
+            name: optax.adam(config.learning_rate).init(params) for name, params in trained.items()
+        },
         key=key,
         updates=jnp.zeros((), jnp.int32),
     )
@@ -130,8 +143,8 @@ def init(config: SacConfig, key: Array, observation_size: int, action_size: int,
 def act(
     config: SacConfig, actor: Any, observation: Float[Array, "*batch features"], key: Array | None
 ) -> Float[Array, "*batch actions"]:
-    """Actions in (-1, 1): sampled, or without a key the hyperbolic tangent of the mean. Observations are of any
-    floating point type; what the actor does not see may follow."""
+    """Actions in (-1, 1): sampled, or without a key the hyperbolic tangent of the mean.
+    Observations are of any floating point type; what the actor does not see may follow."""
     network = _actor(config, networks.action_size(actor, config.policy_layers))
     seen = jnp.asarray(observation, jnp.float32)[..., : networks.input_size(actor)]
     mean, log_std = network.apply(actor, seen)
@@ -146,15 +159,22 @@ def act_with_value(
     actions = networks.action_size(learner.actor, config.policy_layers)
     mean, log_std = _actor(config, actions).apply(learner.actor, public)
     action, log_prob = networks.sample_action(mean, log_std, key)
-    values = _critic(config).apply(learner.critic, observation if config.privileged else public, action)
+    values = _critic(config).apply(
+        learner.critic, observation if config.privileged else public, action
+    )
     return action, jnp.mean(values, axis=0), -jnp.exp(learner.log_temperature) * log_prob
 
 
-def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """One gradient step: critics, then actor, then temperature or value network, then target network. Returns the new
-    learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)), `temperature`
-    (before its step) and, with a value network, `value_loss`."""
-    observation, action, reward, next_observation, discount = (jnp.asarray(x, jnp.float32) for x in batch)
+def update(
+    config: SacConfig, learner: Learner, batch: Transition
+) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+    """One gradient step: critics, then actor, then temperature or value network, then target
+    network. Returns the new learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of
+    the action in (-1, 1)), `temperature` (before its step) and, with a value network,
+    `value_loss`."""
+    observation, action, reward, next_observation, discount = (
+        jnp.asarray(x, jnp.float32) for x in batch
+    )
     inputs = networks.input_size(learner.actor)
     public, next_public = observation[:, :inputs], next_observation[:, :inputs]
     if not config.privileged:
@@ -187,10 +207,15 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
     def actor_loss(params):
         mean, log_std = actor_network.apply(params, public)
         chosen, log_prob = networks.sample_action(mean, log_std, policy_key)
-        soft = jnp.min(critic_network.apply(critic, observation, chosen), axis=0) - temperature * log_prob
+        soft = (
+            jnp.min(critic_network.apply(critic, observation, chosen), axis=0)
+            - temperature * log_prob
+        )
         return -jnp.mean(soft), (soft, -jnp.mean(log_prob))
 
-    (actor_error, (soft, entropy)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(learner.actor)
+    (actor_error, (soft, entropy)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
+        learner.actor
+    )
     actor = step("actor", learner.actor, gradient)
     metrics = {
         "critic_loss": critic_error,
@@ -202,7 +227,9 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
 
     log_temperature, value, source = learner.log_temperature, learner.value, critic
     if config.learn_temperature:  # gradient of log_temperature (entropy - target_entropy)
-        target_entropy = -float(action.shape[-1]) if config.target_entropy is None else config.target_entropy
+        target_entropy = (
+            -float(action.shape[-1]) if config.target_entropy is None else config.target_entropy
+        )
         log_temperature = step("temperature", log_temperature, entropy - target_entropy)
     if config.variant == "value":
 
@@ -215,6 +242,8 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
     updates = learner.updates + 1
     due = updates % config.target_every == 0
     target = jax.tree.map(
-        lambda old, new: jnp.where(due, (1 - config.tau) * old + config.tau * new, old), learner.target, source
+        lambda old, new: jnp.where(due, (1 - config.tau) * old + config.tau * new, old),
+        learner.target,
+        source,
     )
     return Learner(actor, critic, value, target, log_temperature, optimizers, key, updates), metrics

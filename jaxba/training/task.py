@@ -1,4 +1,5 @@
-"""What a training run consists of: scenes, game, and the comparison with baselines on held-out scenes."""
+"""What a training run consists of: scenes, game, and the comparison with baselines on held-out
+scenes."""
 
 from __future__ import annotations
 
@@ -17,7 +18,15 @@ from jaxba.damping import DampingPolicy, make_policy
 from jaxba.damping.learned import LearnedPolicy, always, learned_from
 from jaxba.damping.registry import BOLD, LEARNED
 from jaxba.game.env import Game, make_game
-from jaxba.game.evaluate import Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
+from jaxba.game.evaluate import (
+    Score,
+    best_constant_action,
+    best_costs,
+    evaluate,
+    iterations_to,
+    play_all,
+    scores,
+)
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_split, select
 from jaxba.game.statistics import paired_ratio
@@ -33,14 +42,18 @@ RULES = "rules.npz"
 CONSTANT = "constant action"  # name of the best constant action on training scenes
 
 BASELINES = ("ceres", "classic", "gtsam", "gauss-newton", "schedule", BOLD, LEARNED, CONSTANT)
-"""Rules and the shipped network with plain steps; `bold` and the constant action with the agent's guard and step."""
+"""Rules and the shipped network with plain steps; `bold` and the constant action with the agent's
+guard and step."""
 
 TRAINED = "trained"  # name of the trained policy in tables
 
-Comparison: TypeAlias = tuple[dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]]
-"""Trained policies on the held-out scenes: scores by name (of every agent if there are several, the mean of all agents,
-and of the baselines); iterations of the trained policies over those of each baseline, scene by scene (`paired_ratio`),
-geometric mean over agents; and the same for every agent."""
+Comparison: TypeAlias = tuple[
+    dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]
+]
+"""Trained policies on the held-out scenes: scores by name (of every agent if there are several, the
+mean of all agents, and of the baselines); iterations of the trained policies over those of each
+baseline, scene by scene (`paired_ratio`), geometric mean over agents; and the same for every
+agent."""
 
 
 @dataclass(frozen=True)
@@ -68,22 +81,28 @@ class Task:
         return first_scenes(self.game.bank, self.held_out)
 
     def evaluate(self, actor: Any) -> dict[str, float]:
-        """Scores of a policy by their names in the log. `training/score` chooses among policies: on training scenes,
-        the mean number of iterations, the limit for a failure. Those on held-out scenes are for the eye alone."""
+        """Scores of a policy by their names in the log. `training/score` chooses among policies: on
+        training scenes, the mean number of iterations, the limit for a failure. Those on held-out
+        scenes are for the eye alone."""
         rules = self.config.game
         found = {}
         for name, bank in (("training", self.chosen_on), ("held_out", self.held_out)):
             arguments = self.policy(actor), self.game.options, rules.tolerance, rules.max_iterations
             scored = evaluate(self.game.kind, bank, *arguments)
             fields = scored._asdict()
-            found |= {f"{name}/score": fields.pop("mean")} | {f"{name}/{field}": x for field, x in fields.items()}
+            found |= {f"{name}/score": fields.pop("mean")} | {
+                f"{name}/{field}": x for field, x in fields.items()
+            }
         return found
 
     def compare(self, actors: Sequence[Any]) -> Comparison:
         """Trained policies beside the baselines, relative to the best costs of all."""
         tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
         names = [f"{TRAINED} {k + 1}" for k in range(len(actors))]
-        steps = {name: (self.policy(actor), self.game.options) for name, actor in zip(names, actors, strict=True)}
+        steps = {
+            name: (self.policy(actor), self.game.options)
+            for name, actor in zip(names, actors, strict=True)
+        }
         alone = play_all(self.game.kind, self.held_out, steps, limit)
         best = best_costs({**alone, **self.baseline_runs}, self.held_out)
         found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
@@ -110,17 +129,20 @@ def build(
     baselines: Sequence[str] | None = None,
     on_game: Callable[[Game], Any] = lambda _: None,
 ) -> Task:
-    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. `report` is called with a
-    line when something long begins; `baselines` are names to compare with, unless the folder has results; `BASELINES`
-    if None; `on_game` is called with the game first. Raises ValueError: too few scenes are usable, or another version
-    wrote the files; one line for a person. Raises OSError: the folder cannot be written or read."""
+    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder.
+    `report` is called with a line when something long begins; `baselines` are names to compare
+    with, unless the folder has results; `BASELINES` if None; `on_game` is called with the game
+    first. Raises ValueError: too few scenes are usable, or another version wrote the files; one
+    line for a person. Raises OSError: the folder cannot be written or read."""
     path = folder / BANK
     if path.is_file():
         report("reading the scenes")
         split = read_split(path)
     else:
         key, limit = jax.random.key(config.seed), config.game.max_iterations
-        split = make_split(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
+        split = make_split(
+            config.bank, key, config.bank.options, limit, report, config.game.tolerance
+        )
         _write_split(path, split)
     game = make_game(config.game, config.bank.kind, split.train, config.envs, config.step_options)
     on_game(game)
@@ -146,8 +168,11 @@ def _baseline_runs(
         bank = first_scenes(game.bank, held_out)
         found = best_constant_action(game.kind, bank, config.game, game.options, policies)
         policies[CONSTANT] = always(found, config.game.agent), game.options
-    runs = play_all(game.kind, held_out, policies, config.game.max_iterations)  # in the order of the table
-    arrays = {f"{name}/{field}": x for name, run in runs.items() for field, x in run._asdict().items()}
+    # in the order of the table
+    runs = play_all(game.kind, held_out, policies, config.game.max_iterations)
+    arrays = {
+        f"{name}/{field}": x for name, run in runs.items() for field, x in run._asdict().items()
+    }
     checkpoint.write_arrays(path, arrays)
     return runs
 
@@ -155,26 +180,32 @@ def _baseline_runs(
 def baseline_policies(
     config: TrainConfig, options: StepOptions, names: Sequence[str]
 ) -> dict[str, tuple[DampingPolicy, StepOptions]]:
-    """Policy and step of every baseline, in the order of the table; `options` are those of the agent's step. Names are
-    as in `BASELINES`, without `CONSTANT`; the rule that belongs to the method comes first."""
+    """Policy and step of every baseline, in the order of the table; `options` are those of the
+    agent's step. Names are as in `BASELINES`, without `CONSTANT`; the rule that belongs to the
+    method comes first."""
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     found = {name: (make_policy(name), config.step_options) for name in (*own, *names)}
     return found | ({BOLD: (always(-1.0, config.game.agent), options)} if BOLD in found else {})
 
 
 def _write_split(path: Path, split: Split) -> None:
-    checkpoint.write_arrays(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(split).items()})
+    checkpoint.write_arrays(
+        path, {name.replace(".", "/"): x for name, x in checkpoint.pack(split).items()}
+    )
 
 
 def read_split(path: Path) -> Split:
-    """The scenes of a run's folder. Raises TrainError: another version wrote them, or the file is damaged."""
+    """The scenes of a run's folder. Raises TrainError: another version wrote them, or the file is
+    damaged."""
     return _named_tuple(path, Split, "", _read(path))
 
 
 def _read_runs(path: Path) -> dict[str, Trajectories]:
     arrays = _read(path)
     names = dict.fromkeys(name.rpartition("/")[0] for name in arrays)
-    return {name: _named_tuple(path, Trajectories, f"{name}/", arrays, np.asarray) for name in names}
+    return {
+        name: _named_tuple(path, Trajectories, f"{name}/", arrays, np.asarray) for name in names
+    }
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -185,7 +216,11 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _named_tuple(
-    path: Path, kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
+    path: Path,
+    kind: Any,
+    prefix: str,
+    arrays: Mapping[str, np.ndarray],
+    make: Callable[[Any], Any] = jnp.asarray,
 ) -> Any:
     """Rebuilds nested named tuples from the types of their fields."""
     values = {}
@@ -195,5 +230,7 @@ def _named_tuple(
         elif (key := prefix + name) in arrays:
             values[name] = make(arrays[key])
         else:
-            raise TrainError(f"{path}: written by another version ({key} is missing); begin in a new folder")
+            raise TrainError(
+                f"{path}: written by another version ({key} is missing); begin in a new folder"
+            )
     return kind(**values)

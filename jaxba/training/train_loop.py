@@ -1,6 +1,7 @@
 """Training as one compiled program: act, step, store, sample and update in one scan.
 
-No data leaves the device within a chunk, which compiles once; the driver evaluates and saves between chunks."""
+No data leaves the device within a chunk, which compiles once; the driver evaluates and saves
+between chunks."""
 
 from __future__ import annotations
 
@@ -31,8 +32,8 @@ class LoopConfig:
     """Transitions in the replay buffer; the oldest are overwritten first."""
 
     warmup_steps: int = 500
-    """Environment steps, over all environments, with actions of `Environment.demonstrate` before the agent acts.
-    Rounded up to whole vector steps. Source of the default: Belder et al. 2023."""
+    """Environment steps, over all environments, with actions of `Environment.demonstrate` before
+    the agent acts. Rounded up to whole vector steps. Source of the default: Belder et al. 2023."""
 
     updates_per_step: int = 1
     """Gradient updates after each vector step, that is, of all environments."""
@@ -58,14 +59,26 @@ class LoopState(NamedTuple):
     updates: Int[Array, ""]
 
 
-def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions"]) -> tuple[LoopState, Step]:
-    """One vector step, stored in the buffer. A truncated episode has discount 1 and its true last observation."""
+def _play(
+    env: Environment, state: LoopState, action: Float[Array, "envs actions"]
+) -> tuple[LoopState, Step]:
+    """One vector step, stored in the buffer. A truncated episode has discount 1 and its true last
+    observation."""
     env_state, step = env.step(state.env_state, action)
-    # refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast
-    chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
-    chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
+    # refuses an environment whose shapes are not those of the protocol, when it is traced: the
+    # buffer would broadcast
+    chex.assert_shape(
+        [step.observation, step.final_observation], (env.num_envs, env.observation_size)
+    )
+    chex.assert_shape(
+        [step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,)
+    )
     transitions = Transition(
-        state.observation, action, step.reward, step.final_observation, 1.0 - jnp.asarray(step.terminated, jnp.float32)
+        state.observation,
+        action,
+        step.reward,
+        step.final_observation,
+        1.0 - jnp.asarray(step.terminated, jnp.float32),
     )
     after = state._replace(
         replay=ring.add(state.replay, transitions),
@@ -78,14 +91,17 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
 
 @functools.partial(jit, static_argnames=("sac", "loop"))
 def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
-    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions. Arrays of `env`, a pytree,
-    are traced. The same key gives bitwise identical results on the same machine."""
+    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions. Arrays
+    of `env`, a pytree, are traced. The same key gives bitwise identical results on the same
+    machine."""
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
     env_state, observation = env.reset(reset_key)
     chex.assert_shape(observation, (env.num_envs, env.observation_size))
     zero = lambda: jnp.zeros((), jnp.int32)
     state = LoopState(
-        learner=agent.init(sac, learner_key, env.observation_size, env.action_size, env.privileged_size),
+        learner=agent.init(
+            sac, learner_key, env.observation_size, env.action_size, env.privileged_size
+        ),
         replay=ring.init(loop.replay_capacity, env.observation_size, env.action_size),
         env_state=env_state,
         observation=jnp.asarray(observation, jnp.float32),
@@ -106,19 +122,22 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
 def run_chunk(
     sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
 ) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
-    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates. The state is
-    donated; its memory is reused for the result. Returns the state after the chunk, and means over it: those of
-    `sac.update`; `reward` of a step; `action_mean`, `action_std`; `action_spread`, the standard deviation of the mean
-    action over replayed states; `q_bias`, what the critics expected more than what came, entropy included, in episodes
-    that were terminated (NaN if none was); `episodes`, the number of episodes that ended, and `episode/NAME`, the mean
-    of a metric of the environment over them (0 if none ended); `dropped`, transitions with numbers that are not
-    finite."""
+    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step`
+    updates. The state is donated; its memory is reused for the result. Returns the state after the
+    chunk, and means over it: those of `sac.update`; `reward` of a step; `action_mean`,
+    `action_std`; `action_spread`, the standard deviation of the mean action over replayed states;
+    `q_bias`, what the critics expected more than what came, entropy included, in episodes that were
+    terminated (NaN if none was); `episodes`, the number of episodes that ended, and `episode/NAME`,
+    the mean of a metric of the environment over them (0 if none ended); `dropped`, transitions with
+    numbers that are not finite."""
 
     def body(state: LoopState, _: None) -> tuple[LoopState, tuple[Any, ...]]:
         key, act_key, sample_key = jax.random.split(state.key, 3)
         action, value, bonus = agent.act_with_value(sac, state.learner, state.observation, act_key)
         state, step = _play(env, state._replace(key=key), action)
-        learn = lambda learner, key: agent.update(sac, learner, ring.sample(state.replay, key, sac.batch))
+        learn = lambda learner, key: agent.update(
+            sac, learner, ring.sample(state.replay, key, sac.batch)
+        )
         keys = jax.random.split(sample_key, loop.updates_per_step)
         learner, learned = jax.lax.scan(learn, state.learner, keys)
         state = state._replace(learner=learner, updates=state.updates + loop.updates_per_step)
@@ -127,17 +146,26 @@ def run_chunk(
         means["action_mean"] = jnp.mean(action)
         means["action_square"] = jnp.mean(action**2)
         ended = step.terminated | step.truncated
-        sums = {name: jnp.sum(jnp.where(ended, x, 0), dtype=jnp.float32) for name, x in step.metrics.items()}
-        judged = _Judged(value, bonus, jnp.asarray(step.reward, jnp.float32), step.terminated, ended)
+        sums = {
+            name: jnp.sum(jnp.where(ended, x, 0), dtype=jnp.float32)
+            for name, x in step.metrics.items()
+        }
+        judged = _Judged(
+            value, bonus, jnp.asarray(step.reward, jnp.float32), step.terminated, ended
+        )
         return state, (means, sums, jnp.sum(ended, dtype=jnp.float32), judged)
 
     dropped = state.replay.dropped
-    state, (means, sums, ended, judged) = jax.lax.scan(body, state, None, length=loop.steps_per_chunk)
+    state, (means, sums, ended, judged) = jax.lax.scan(
+        body, state, None, length=loop.steps_per_chunk
+    )
     metrics = {name: jnp.mean(values) for name, values in means.items()}
     variance = metrics.pop("action_square") - metrics["action_mean"] ** 2
     metrics["action_std"] = jnp.sqrt(jnp.maximum(variance, 0))
     seen = ring.sample(state.replay, jax.random.fold_in(state.key, 0), sac.batch).observation
-    metrics["action_spread"] = jnp.mean(jnp.std(agent.act(sac, state.learner.actor, seen, None), axis=0))
+    metrics["action_spread"] = jnp.mean(
+        jnp.std(agent.act(sac, state.learner.actor, seen, None), axis=0)
+    )
     metrics["q_bias"] = _bias(judged, sac.gamma)
     metrics["dropped"] = jnp.asarray(state.replay.dropped - dropped, jnp.float32)
     metrics["episodes"] = jnp.sum(ended)
@@ -147,7 +175,8 @@ def run_chunk(
 
 
 class _Judged(NamedTuple):
-    """What the critics said of the actions of a chunk, and what came of them: (steps, envs) each."""
+    """What the critics said of the actions of a chunk, and what came of them: (steps, envs)
+    each."""
 
     value: Array
     bonus: Array  # for the entropy of the action
@@ -157,9 +186,12 @@ class _Judged(NamedTuple):
 
 
 def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
-    """Mean value less the return that followed, over the actions whose episode was terminated within the chunk."""
+    """Mean value less the return that followed, over the actions whose episode was terminated
+    within the chunk."""
 
-    def back(after: tuple[Array, Array], one: _Judged) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def back(
+        after: tuple[Array, Array], one: _Judged
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         future, known = after
         found = one.reward + gamma * jnp.where(one.ended, 0, future)
         known = one.terminated | (known & ~one.ended)
@@ -172,7 +204,8 @@ def _bias(judged: _Judged, gamma: float) -> Float[Array, ""]:
 
 @functools.partial(jit, once=True, static_argnames=("sac", "loop"))
 def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
-    """`start` for an agent a key; they share the environment's scenes, and are the state's first axis."""
+    """`start` for an agent a key; they share the environment's scenes, and are the state's first
+    axis."""
     return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
 
 

@@ -10,8 +10,10 @@ from jaxba.training.log import Row
 
 YARDSTICKS = ("ceres", "constant action")  # baselines beside which held-out scores are printed
 MOST_ENTROPY = math.log(2)  # nats of a uniform action in (-1, 1)
-RANDOM = 0.1  # nats below `MOST_ENTROPY` within which a policy acts at random: over nine tenths of the range
-SAME = 0.1  # decades of lambda; a policy with a smaller spread over states does the same in every state
+# nats below `MOST_ENTROPY` within which a policy acts at random: over nine tenths of the range
+RANDOM = 0.1
+# decades of lambda; a policy with a smaller spread over states does the same in every state
+SAME = 0.1
 
 
 def lines(
@@ -22,11 +24,12 @@ def lines(
     decades: float = 5.5,
     left_s: float = 0.0,
 ) -> list[str]:
-    """A line on a finished chunk and one on the agents' health, and one on held-out scores if there are any. The last
-    one is a warning if there are scores, and some agents' policies are the same everywhere or random. Rows are those of
-    one chunk in the log, one of every agent, of so many chunks in all; `rules` has a `Score` by name of the baseline.
-    `best`: whether a policy of this chunk is the best so far. `decades`: of lambda that an action of 1 is above 0.
-    `left_s`: seconds that the other chunks will take."""
+    """A line on a finished chunk and one on the agents' health, and one on held-out scores if there
+    are any. The last one is a warning if there are scores, and some agents' policies are the same
+    everywhere or random. Rows are those of one chunk in the log, one of every agent, of so many
+    chunks in all; `rules` has a `Score` by name of the baseline. `best`: whether a policy of this
+    chunk is the best so far. `decades`: of lambda that an action of 1 is above 0. `left_s`: seconds
+    that the other chunks will take."""
     row = rows[0]
     start = f"chunk {row['chunk']}/{chunks}: "
     text = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
@@ -42,7 +45,8 @@ def lines(
     if values:
         text = f"held out {_mean(rows, 'held_out/score'):.2f} iterations"
         text += f" ({min(values):.2f} to {max(values):.2f})" if len(rows) > 1 else ""
-        text += f", p90 {_mean(rows, 'held_out/p90'):.0f}, failures {100 * _mean(rows, 'held_out/failures'):.1f} %"
+        text += f", p90 {_mean(rows, 'held_out/p90'):.0f}"
+        text += f", failures {100 * _mean(rows, 'held_out/failures'):.1f} %"
         shown = [f"{name} {rules[name].mean:.2f}" for name in YARDSTICKS if name in rules]
         text += f" ({', '.join(shown)})" if shown else ""
         found.append(f"{start}{text}{', best on training scenes so far' if best else ''}")
@@ -66,7 +70,10 @@ def _warning(rows: Sequence[Row], decades: float) -> list[str]:
         found.append(f"{who(same)} {does(same)} the same in every state ({_spread(same, decades)})")
     if random:
         values = ", ".join(f"{row['entropy']:.2f}" for row in random)
-        found.append(f"{who(random)} {does(random)} anything at random (entropy {values} of {MOST_ENTROPY:.2f} nats)")
+        found.append(
+            f"{who(random)} {does(random)} anything at random (entropy {values} of "
+            f"{MOST_ENTROPY:.2f} nats)"
+        )
     return [f"warning: {'; '.join(found)}"] if found else []
 
 

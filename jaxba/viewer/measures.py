@@ -1,4 +1,5 @@
-"""How well a problem's points and images fit: reprojection errors, track lengths, the worst images."""
+"""How well a problem's points and images fit: reprojection errors, track lengths, the worst
+images."""
 
 from __future__ import annotations
 
@@ -10,13 +11,15 @@ from jaxtyping import Float, Int, UInt8
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 
-VIRIDIS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))  # matplotlib's, at quarters
+# matplotlib's, at quarters
+VIRIDIS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 
 
 class Measures(NamedTuple):
     """How well a problem fits. What is not observed, or not projected to a finite pixel, is NaN."""
 
-    residuals: Float[np.ndarray, "observations 2"]  # measured minus predicted, pixels of the problem
+    # measured minus predicted, pixels of the problem
+    residuals: Float[np.ndarray, "observations 2"]
     of_point: Float[np.ndarray, " points"]  # root mean square length of its residuals, pixels
     of_image: Float[np.ndarray, " cameras"]  # the same of each image
     tracks: Int[np.ndarray, " points"]  # number of observations of each point
@@ -61,9 +64,12 @@ def limits(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 def colours(values: Float[np.ndarray, " n"], low: float, high: float) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of positive values on a logarithmic scale from `low` to `high`; the brightest where there is no value."""
+    """Colours of positive values on a logarithmic scale from `low` to `high`; the brightest where
+    there is no value."""
     with np.errstate(divide="ignore", invalid="ignore"):
         place = np.log(values / low) / np.log(high / low)
     place = np.nan_to_num(place, nan=1.0, posinf=1.0, neginf=0.0)
     at = np.linspace(0, 1, len(VIRIDIS))
-    return np.stack([np.interp(place, at, channel) for channel in zip(*VIRIDIS, strict=True)], axis=1).astype(np.uint8)
+    return np.stack(
+        [np.interp(place, at, channel) for channel in zip(*VIRIDIS, strict=True)], axis=1
+    ).astype(np.uint8)

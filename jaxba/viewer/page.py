@@ -1,4 +1,5 @@
-"""The page: stages side by side, and a panel with a slider, numbers, colours, filters and the worst images."""
+"""The page: stages side by side, and a panel with a slider, numbers, colours, filters and the worst
+images."""
 
 from __future__ import annotations
 
@@ -24,17 +25,23 @@ from jaxba.viewer.stage import ERROR, POINT_SIZE, SHOWN_POINTS, Stage
 NOTHING: str = "none: the whole scene"
 FRAME_S = 0.5  # seconds for which an iteration is shown while the page plays
 PICKED = 8  # pixels at most between a click and the point that it means
-NEAR = 0.3  # how near something is drawn in the view of an image's camera, as a share of the way to the image
+# how near something is drawn in the view of an image's camera, as a share of the way to the image
+NEAR = 0.3
 
 
 class Viewer:
     """A page that is served until it is closed."""
 
     def __init__(self, all_shown: Sequence[Shown], host: str = HOST) -> None:
-        """Serves a page at port 8080 or the next free one of an address of this machine; `0.0.0.0`: of all of them."""
-        self.host, self.server = host, quietly(viser.ViserServer, host=host, label="jaxba", verbose=False)
+        """Serves a page at port 8080 or the next free one of an address of this machine; `0.0.0.0`:
+        of all of them."""
+        self.host, self.server = (
+            host,
+            quietly(viser.ViserServer, host=host, label="jaxba", verbose=False),
+        )
         self._lock, self._playing = threading.RLock(), False
-        self._hit = self._inside = None  # where the last click met an image, and where the chosen one was taken
+        # where the last click met an image, and where the chosen one was taken
+        self._hit = self._inside = None
         self.stages = stages(self.server, all_shown, SHOWN_POINTS, self._clicked)
         self.server.scene.on_click()(self._pointed)
         self._panel()
@@ -55,16 +62,22 @@ class Viewer:
         return sum(stage.load_images() for stage in self.stages)
 
     def _repr_html_(self) -> str:
-        """A page in a file, inside of a notebook: it needs no server, so that a saved notebook shows it."""
+        """A page in a file, inside of a notebook: it needs no server, so that a saved notebook
+        shows it."""
         page = html.escape(page_of([stage.shown for stage in self.stages]))
         return f'<iframe srcdoc="{page}" width="100%" height="600" style="border:0"></iframe>'
 
-    def choose(self, stage: Stage, camera: int | None, client: viser.ClientHandle | None = None) -> None:
-        """Marks an image, says how well it fits, and moves a client into its camera, or for None to the whole scene."""
+    def choose(
+        self, stage: Stage, camera: int | None, client: viser.ClientHandle | None = None
+    ) -> None:
+        """Marks an image, says how well it fits, and moves a client into its camera, or for None to
+        the whole scene."""
         with self._lock:
             for one in self.stages:
                 one.change(chosen=camera if one is stage else None, tracked=None)
-            self._listed = {name: (one, k) for one in self.stages for name, k in words.worst_images(one)}
+            self._listed = {
+                name: (one, k) for one in self.stages for name, k in words.worst_images(one)
+            }
             name = NOTHING if camera is None else words.entry(stage, camera)
             self._listed |= {} if camera is None else {name: (stage, camera)}
             self._picked.options, self._picked.value = (NOTHING, *self._listed), name
@@ -75,13 +88,28 @@ class Viewer:
     def _move(self, client: viser.ClientHandle, stage: Stage, camera: int | None) -> None:
         start, view, self._inside = self.server.initial_camera, client.camera, None
         if camera is None:
-            place, target, up, fov, near = start.position, start.look_at, (0.0, 0.0, 1.0), start.fov, start.near
+            place, target, up, fov, near = (
+                start.position,
+                start.look_at,
+                (0.0, 0.0, 1.0),
+                start.fov,
+                start.near,
+            )
         else:
             pose, half, depth = stage.view_of(camera)
             place, up, near = pose[:, 3] + stage.place, -pose[:, 1], NEAR * depth
-            target, fov = place + depth * pose[:, 2], 2 * np.arctan(1.05 * max(half[1], half[0] / view.aspect))
+            target, fov = (
+                place + depth * pose[:, 2],
+                2 * np.arctan(1.05 * max(half[1], half[0] / view.aspect)),
+            )
             self._inside = place
-        view.position, view.look_at, view.up_direction, view.fov, view.near = place, target, up, float(fov), near
+        view.position, view.look_at, view.up_direction, view.fov, view.near = (
+            place,
+            target,
+            up,
+            float(fov),
+            near,
+        )
 
     def _clicked(self, place: int, camera: int, event: viser.SceneNodePointerEvent) -> None:
         if not self._is_inside(event.client):  # there a click is on a point
@@ -90,12 +118,18 @@ class Viewer:
 
     def _is_inside(self, client: viser.ClientHandle) -> bool:
         """Whether a client looks from the camera that is chosen."""
-        return self._inside is not None and np.allclose(client.camera.position, self._inside, atol=1e-4)
+        return self._inside is not None and np.allclose(
+            client.camera.position, self._inside, atol=1e-4
+        )
 
     def _pointed(self, event: viser.SceneClickEvent) -> None:
         """A click on a point, or on nothing. That on an image comes here, too."""
         view = event.client.camera
-        ray = np.array(event.ray_origin), np.array(event.ray_direction), PICKED * view.fov / view.image_height
+        ray = (
+            np.array(event.ray_origin),
+            np.array(event.ray_direction),
+            PICKED * view.fov / view.image_height,
+        )
         if event.screen_pos != self._hit:
             with self._lock:
                 for stage in self.stages:
@@ -103,22 +137,33 @@ class Viewer:
                 self._tell()
 
     def grow(self, recording: Recording) -> None:
-        """Shows the last iteration of a solve that is running, unless another one is being looked at."""
+        """Shows the last iteration of a solve that is running, unless another one is being looked
+        at."""
         shown, last = self.stages[0].shown, recording.last
         newest = self.stages[0].iteration == shown.recording.last
         self._change(shown=replace(shown, recording=recording))
-        self._slider.max, self._slider.visible, self._play.visible = max(last, 1), last > 0, last > 0
+        self._slider.max, self._slider.visible, self._play.visible = (
+            max(last, 1),
+            last > 0,
+            last > 0,
+        )
         if newest:
             self._slider.value = last
 
     def _panel(self) -> None:
         gui, last = self.server.gui, max(stage.shown.recording.last for stage in self.stages)
         gui.main_panel.dock_right()
-        dress = lambda dark: gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=dark)
+        dress = lambda dark: gui.configure_theme(
+            show_share_button=False, show_logo=False, dark_mode=dark
+        )
         dress(False)
-        lines = [f"**{words.plain(stage.shown.name)}**: {words.sizes(stage)}" for stage in self.stages]
+        lines = [
+            f"**{words.plain(stage.shown.name)}**: {words.sizes(stage)}" for stage in self.stages
+        ]
         if len(lines) > 1:
-            lines = [f'<font color="{colour_of(k)}">●</font> {line}' for k, line in enumerate(lines)]
+            lines = [
+                f'<font color="{colour_of(k)}">●</font> {line}' for k, line in enumerate(lines)
+            ]
         gui.add_markdown("\n\n".join(lines))
         self._slider = gui.add_slider("iteration", 0, max(last, 1), 1, last, visible=last > 0)
         self._play = gui.add_button("play or stop", visible=last > 0)
@@ -128,9 +173,14 @@ class Viewer:
         self._about = gui.add_markdown("")
         if rows := [line for stage in self.stages for line in words.about_rows(stage)]:
             gui.add_markdown("\n\n".join(rows))
-        choices = list(dict.fromkeys(name for stage in self.stages for name in stage.colour_choices()))
+        choices = list(
+            dict.fromkeys(name for stage in self.stages for name in stage.colour_choices())
+        )
         colour = gui.add_dropdown("colour", choices, initial_value=self.stages[0].colour)
-        ends = [(stage.limits[ERROR][1], stage.measures.tracks.max(initial=2).item()) for stage in self.stages]
+        ends = [
+            (stage.limits[ERROR][1], stage.measures.tracks.max(initial=2).item())
+            for stage in self.stages
+        ]
         self._between("error, px", 0, 2 * max(error for error, _ in ends), "errors")
         self._between("track length", 1, max(length for _, length in ends), "lengths")
         points = gui.add_slider("size of points", 0.001, 0.03, 0.001, POINT_SIZE)
@@ -149,8 +199,11 @@ class Viewer:
         self.choose(self.stages[0], None)
 
     def _between(self, label: str, low: int, high: Any, name: str) -> None:
-        """A slider for the least and the largest value of the points that are shown; at its end it has no limit."""
-        slider = self.server.gui.add_multi_slider(label, low, high, 1 if low else high / 200, (low, high))
+        """A slider for the least and the largest value of the points that are shown; at its end it
+        has no limit."""
+        slider = self.server.gui.add_multi_slider(
+            label, low, high, 1 if low else high / 200, (low, high)
+        )
         ends = lambda least, most: (least if least > low else 0.0, most if most < high else np.inf)
         slider.on_update(lambda _: self._change(**{name: ends(*slider.value)}))
 
@@ -172,7 +225,9 @@ class Viewer:
 
         assert event.client is not None  # it has clicked
         view, file = event.client.camera, io.BytesIO()
-        Image.fromarray(event.client.get_render(view.image_height, view.image_width)).save(file, "PNG")
+        Image.fromarray(event.client.get_render(view.image_height, view.image_width)).save(
+            file, "PNG"
+        )
         event.client.send_file_download("jaxba.png", file.getvalue(), save_immediately=True)
 
     def _change(self, **what: Any) -> None:
@@ -190,6 +245,16 @@ class Viewer:
         self._numbers.content = "\n\n".join(lines)
         self._curve.data, self._curve.scales = curve_of(self.stages)
         self._curve.visible = len(self._curve.data[0]) > 1
-        about = [words.about_image(stage, stage.chosen) for stage in self.stages if stage.chosen is not None]
-        about += [words.about_track(stage, stage.tracked) for stage in self.stages if stage.tracked is not None]
-        self._about.content = "\n\n".join(about) or "Click on an image or a point, or choose one of the worst images."
+        about = [
+            words.about_image(stage, stage.chosen)
+            for stage in self.stages
+            if stage.chosen is not None
+        ]
+        about += [
+            words.about_track(stage, stage.tracked)
+            for stage in self.stages
+            if stage.tracked is not None
+        ]
+        self._about.content = (
+            "\n\n".join(about) or "Click on an image or a point, or choose one of the worst images."
+        )

@@ -1,7 +1,7 @@
 """Recorded solves: the parameters after every accepted step, and what each iteration came to.
 
-A recording is a NumPy archive (`.npz`) of the arrays of the problem and those of `Recording`. Of a large problem it
-holds an even choice of the points, and the observations of these."""
+A recording is a NumPy archive (`.npz`) of the arrays of the problem and those of `Recording`. Of a
+large problem it holds an even choice of the points, and the observations of these."""
 
 from __future__ import annotations
 
@@ -31,12 +31,14 @@ class Recording:
 
     problem: BundleProblem  # the start, thinned
     whole: int  # number of points of the problem, recorded or not
-    cameras: Float[np.ndarray, "states cameras parameters"]  # cameras at the start and after each accepted step
+    # cameras at the start and after each accepted step
+    cameras: Float[np.ndarray, "states cameras parameters"]
     points: Float[np.ndarray, "states points 3"]  # the same of points
     state: Int[np.ndarray, " iterations"]  # position in `cameras` and `points` after each iteration
     cost: Float[np.ndarray, " iterations"]  # accepted cost after each iteration, pixels^2
     damping: Float[np.ndarray, " iterations"]  # lambda; NaN for the start
-    gain_ratio: Float[np.ndarray, " iterations"]  # actual over predicted decrease; NaN for the start
+    # actual over predicted decrease; NaN for the start
+    gain_ratio: Float[np.ndarray, " iterations"]
     time_s: Float[np.ndarray, " iterations"]  # seconds since the start
     source: str = ""  # where the problem was read
 
@@ -62,7 +64,8 @@ def evenly(count: int, limit: int) -> Int[np.ndarray, " kept"]:
 
 
 def of_points(problem: BundleProblem, kept: Int[np.ndarray, " kept"]) -> BundleProblem:
-    """A problem of some of the points, their observations and other rows, for looking at: without constants."""
+    """A problem of some of the points, their observations and other rows, for looking at: without
+    constants."""
     labels, none = problem.labels, dict.fromkeys(("whitening", "constants", "rigs"))
     found = problem.replace(**none).subset(np.isin(problem.point_index, kept), points=kept)
     labels = labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept])
@@ -73,15 +76,23 @@ def still(problem: BundleProblem) -> Recording:
     """A recording of no iterations, of the whole problem."""
     none, zero = np.array([np.nan]), np.zeros(1)
     cameras, points = np.asarray(problem.cameras), np.asarray(problem.points)
-    return Recording(problem, len(points), cameras[None], points[None], np.zeros(1, int), none, none, none, zero)
+    return Recording(
+        problem, len(points), cameras[None], points[None], np.zeros(1, int), none, none, none, zero
+    )
 
 
 class Recorder:
     """What makes a recording: `watch` of `jaxba.solve`."""
 
-    def __init__(self, problem: BundleProblem, source: str = "", limit: int = RECORDED_POINTS) -> None:
+    def __init__(
+        self, problem: BundleProblem, source: str = "", limit: int = RECORDED_POINTS
+    ) -> None:
         self._kept = evenly(problem.num_points, limit)
-        self._problem, self._whole, self._source = of_points(problem, self._kept), problem.num_points, source
+        self._problem, self._whole, self._source = (
+            of_points(problem, self._kept),
+            problem.num_points,
+            source,
+        )
         self._states = [(np.asarray(problem.cameras), np.asarray(problem.points)[self._kept])]
         self._rows = [(0, np.nan, np.nan, np.nan, 0.0)]
 
@@ -101,7 +112,9 @@ class Recorder:
         cameras, points = zip(*self._states, strict=True)
         state, cost, damping, gain, seconds = map(np.array, zip(*self._rows, strict=True))
         states = state, cost, damping, gain, seconds
-        return Recording(self._problem, self._whole, np.stack(cameras), np.stack(points), *states, self._source)
+        return Recording(
+            self._problem, self._whole, np.stack(cameras), np.stack(points), *states, self._source
+        )
 
 
 _ARRAYS = ("observations", "camera_index", "point_index")
@@ -109,7 +122,8 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 
 
 def write_recording(recording: Recording, path: StrPath) -> None:
-    """Writes a recording, whole or not at all; points are float32 from their middle. Raises ProblemError."""
+    """Writes a recording, whole or not at all; points are float32 from their middle. Raises
+    ProblemError."""
     problem, lenses = recording.problem, recording.problem.lenses
     middle, limits = np.median(recording.points[-1], axis=0), np.finfo(np.float32)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
@@ -138,27 +152,61 @@ def read_recording(path: StrPath) -> Recording:
             models = tuple(CAMERA_MODELS[str(one)] for one in found["lens_models"])
             lenses = Lenses(found["lens"], found["lens_free"], found["lens_model"], models)
         points = found["points"].astype(np.float64) + found["middle"]
-        problem = BundleProblem.create(found["cameras"][0], points[0], *(found[key] for key in _ARRAYS), lenses=lenses)
+        problem = BundleProblem.create(
+            found["cameras"][0], points[0], *(found[key] for key in _ARRAYS), lenses=lenses
+        )
         if "names" in found:
             ids = np.arange(problem.num_cameras)
-            problem = problem.replace(labels=Labels(tuple(map(str, found["names"])), ids, ids[:0], ids[:0]))
+            problem = problem.replace(
+                labels=Labels(tuple(map(str, found["names"])), ids, ids[:0], ids[:0])
+            )
         history: dict[str, Any] = {key: found[key] for key in _HISTORY}
         _check(problem, points, history, len(found.get("names", problem.cameras)))
-        return Recording(problem, int(found["whole"]), points=points, source=str(found["source"]), **history)
+        return Recording(
+            problem, int(found["whole"]), points=points, source=str(found["source"]), **history
+        )
     except OSError as error:
         raise ProblemError(f"cannot read {name}: {reason(error)}") from None
     # zipfile raises the RuntimeError, for a compression that a flipped byte names, or a password
-    except (ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
+    except (
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        EOFError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ):
         raise ProblemError(f"{name}: is not a recording of jaxba-solve --record") from None
 
 
-def _check(problem: BundleProblem, points: np.ndarray, history: dict[str, np.ndarray], names: int) -> None:
+def _check(
+    problem: BundleProblem, points: np.ndarray, history: dict[str, np.ndarray], names: int
+) -> None:
     """Raises a ValueError if the parts of a recording do not fit each other."""
     state, cameras = history["state"], history["cameras"]
-    rows = [history[key].shape == (len(state),) for key in ("state", "cost", "damping", "gain_ratio", "time_s")]
+    rows = [
+        history[key].shape == (len(state),)
+        for key in ("state", "cost", "damping", "gain_ratio", "time_s")
+    ]
     steps = np.diff(state, prepend=0)
-    whole = state.dtype.kind in "iu" and len(state) and state[0] == 0 and ((steps == 0) | (steps == 1)).all()
-    shapes = cameras.shape[1:] == problem.cameras.shape and points.shape == (len(cameras), *problem.points.shape)
-    fit = all(rows) and whole and shapes and state[-1] == len(cameras) - 1 and names == problem.num_cameras
+    whole = (
+        state.dtype.kind in "iu"
+        and len(state)
+        and state[0] == 0
+        and ((steps == 0) | (steps == 1)).all()
+    )
+    shapes = cameras.shape[1:] == problem.cameras.shape and points.shape == (
+        len(cameras),
+        *problem.points.shape,
+    )
+    fit = (
+        all(rows)
+        and whole
+        and shapes
+        and state[-1] == len(cameras) - 1
+        and names == problem.num_cameras
+    )
     if not (fit and np.isfinite(cameras).all() and np.isfinite(points).all()):
         raise ValueError("the parts of the recording do not fit")

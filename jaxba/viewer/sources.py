@@ -44,11 +44,16 @@ class Shown:
 
     def size(self, camera: int) -> tuple[float, float]:
         """Width and height of an image, pixels; 0 if it is not at hand."""
-        return self._opened(camera, lambda image: (float(image.width), float(image.height))) or (0.0, 0.0)
+        return self._opened(camera, lambda image: (float(image.width), float(image.height))) or (
+            0.0,
+            0.0,
+        )
 
-    def image(self, camera: int, side: int = SMALL_SIDE) -> UInt8[np.ndarray, "height width 3"] | None:
-        """An image, its longer side at most so many pixels, with white margins that put its principal point in the
-        middle; None if it is not at hand."""
+    def image(
+        self, camera: int, side: int = SMALL_SIDE
+    ) -> UInt8[np.ndarray, "height width 3"] | None:
+        """An image, its longer side at most so many pixels, with white margins that put its
+        principal point in the middle; None if it is not at hand."""
 
         def small(image: Any) -> np.ndarray:
             image.draft("RGB", (2 * side, 2 * side))  # of a JPEG no more than is needed
@@ -56,7 +61,9 @@ class Shown:
             pixels = np.asarray(image.convert("RGB"))
             if self.looks is None or not self.looks.sizes[camera].all():
                 return pixels
-            lack = np.rint((1 - 2 * self.looks.principal[camera] / self.looks.sizes[camera]) * image.size).astype(int)
+            lack = np.rint(
+                (1 - 2 * self.looks.principal[camera] / self.looks.sizes[camera]) * image.size
+            ).astype(int)
             (left, top), (right, bottom) = np.maximum(lack, 0), np.maximum(-lack, 0)
             return np.pad(pixels, ((top, bottom), (left, right), (0, 0)), constant_values=255)
 
@@ -83,8 +90,8 @@ def shown(what: BundleProblem | Recording, name: str) -> Shown:
 
 
 def open_all(paths: Sequence[str], images: str | None = None) -> list[Shown]:
-    """Opens problems in any format that is read, names of downloaded BAL problems, or recordings; `images` is the
-    folder of the images. Raises ProblemError: a file cannot be read; one line."""
+    """Opens problems in any format that is read, names of downloaded BAL problems, or recordings;
+    `images` is the folder of the images. Raises ProblemError: a file cannot be read; one line."""
     found = [_open(path) for path in paths]
     sides = [_sidecar(path, one) for path, one in zip(paths, found, strict=True)]
     return [_with_frames(one, sides, images) for one in found]
@@ -110,7 +117,8 @@ def _sidecar(path: str, one: Shown) -> Sidecar | None:
 
 
 def _with_frames(one: Shown, sides: Sequence[Sidecar | None], images: StrPath | None) -> Shown:
-    """With names and images of a problem of `jaxba-kitti`; the files of one sequence share a sidecar."""
+    """With names and images of a problem of `jaxba-kitti`; the files of one sequence share a
+    sidecar."""
     count = one.problem.num_cameras
     side = next((side for side in sides if side is not None and len(side.frames) == count), None)
     if side is not None and one.names is None:
@@ -121,5 +129,8 @@ def _with_frames(one: Shown, sides: Sequence[Sidecar | None], images: StrPath | 
         one = replace(one, images=Path(images))
     if side is not None and one.looks is None:
         principal = np.tile([side.calibration.cx, side.calibration.cy], (count, 1))
-        one = replace(one, looks=Looks(None, np.array([one.size(camera) for camera in range(count)]), principal))
+        one = replace(
+            one,
+            looks=Looks(None, np.array([one.size(camera) for camera in range(count)]), principal),
+        )
     return one

@@ -10,11 +10,13 @@ import numpy as np
 from jaxba.model.registration import costs_of_rows
 from jaxba.viewer.stage import ERROR, FILE, KINDS, Stage
 
-WORST, WORST_ROWS = 20, 5  # images in the list of the worst; rows of a residual, and images that see a point
+# images in the list of the worst; rows of a residual, and images that see a point
+WORST, WORST_ROWS = 20, 5
 
 
 def plain(name: str) -> str:
-    """A name as Markdown that means just its characters: viser renders HTML and Markdown as they come."""
+    """A name as Markdown that means just its characters: viser renders HTML and Markdown as they
+    come."""
     return re.sub(r"([\\`*_{}\[\]()#+.!|~>-])", r"\\\1", html.escape(name)) if name else name
 
 
@@ -22,7 +24,10 @@ def sizes(stage: Stage) -> str:
     """Sizes of what is shown, and how much of it."""
     recording, problem = stage.shown.recording, stage.shown.problem
     part = lambda shown, whole: f"{shown:,}" if shown == whole else f"{shown:,} of {whole:,}"
-    images, points = part(len(stage.frusta), problem.num_cameras), part(len(stage.points), recording.whole)
+    images, points = (
+        part(len(stage.frusta), problem.num_cameras),
+        part(len(stage.points), recording.whole),
+    )
     of = " of these points" if recording.whole > problem.num_points else ""
     return f"{images} images, {points} points, {problem.num_observations:,} observations{of}"
 
@@ -35,7 +40,10 @@ def worst_images(stage: Stage, count: int = WORST) -> list[tuple[str, int]]:
 def entry(stage: Stage, camera: int) -> str:
     """An image in the list: its error, name and observations."""
     measures = stage.measures
-    return f"{measures.of_image[camera]:.3g} px: {stage.shown.name_of(camera)} ({measures.seen[camera]:,})"
+    return (
+        f"{measures.of_image[camera]:.3g} px: {stage.shown.name_of(camera)} "
+        f"({measures.seen[camera]:,})"
+    )
 
 
 def numbers(stage: Stage) -> str:
@@ -61,10 +69,13 @@ def meaning(stage: Stage) -> str:
 
 
 def about_rows(stage: Stage) -> list[str]:
-    """For each residual besides those of pixels its colour, its cost and its worst rows, at the iteration shown."""
+    """For each residual besides those of pixels its colour, its cost and its worst rows, at the
+    iteration shown."""
     rows, lines = stage.problem.residuals.rows, []
     for number, costs in enumerate(costs_of_rows(stage.problem) if rows else ()):
-        worst = ", ".join(f"{row} ({costs[row]:.3g})" for row in np.argsort(-costs, kind="stable")[:WORST_ROWS])
+        worst = ", ".join(
+            f"{row} ({costs[row]:.3g})" for row in np.argsort(-costs, kind="stable")[:WORST_ROWS]
+        )
         colour, name = KINDS[number % len(KINDS)], plain(rows[number].residual.name)
         cost = f"cost {costs.sum():.5g} of {len(costs):,} rows; the worst: {worst}"
         lines.append(f'<font color="rgb{colour}">●</font> **{name}**: {cost}')
@@ -86,4 +97,7 @@ def about_track(stage: Stage, point: int) -> str:
     order = np.argsort(-errors, kind="stable")[:WORST_ROWS]
     name = lambda row: plain(stage.shown.name_of(int(stage.problem.camera_index[row])))
     seen = ", ".join(f"{errors[k]:.3g} px in {name(rows[k])}" for k in order)
-    return f"**point {point}**: {len(rows)} images, RMSE {stage.measures.of_point[point]:.3g} px; the worst: {seen}"
+    return (
+        f"**point {point}**: {len(rows)} images, RMSE {stage.measures.of_point[point]:.3g} px; "
+        f"the worst: {seen}"
+    )

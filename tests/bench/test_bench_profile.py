@@ -13,13 +13,32 @@ from jaxba.solver.record import Record, TracePoint
 
 
 def make_record(problem, solver, costs, *, step_s=1.0, repeat=0, termination="ftol"):
-    """A run whose i-th iteration ends at `i * step_s` with accepted cost `costs[i]`; equal costs are rejections."""
+    """A run whose i-th iteration ends at `i * step_s` with accepted cost `costs[i]`; equal costs
+    are rejections."""
     trace = [TracePoint(0, 0.0, costs[0], math.nan, True, 0, math.nan)]
     for i, (before, cost) in enumerate(pairwise(costs), start=1):
-        trace.append(TracePoint(i, i * step_s, cost, 1e-3, cost < before, 0, 0.5 if cost < before else -1.0))
+        trace.append(
+            TracePoint(i, i * step_s, cost, 1e-3, cost < before, 0, 0.5 if cost < before else -1.0)
+        )
     accepted = sum(p.accepted for p in trace[1:])
     ends = (len(costs) * step_s, costs[0], costs[-1], len(costs) - 1, accepted, 0, termination)
-    return Record(problem, "f", 2, 3, 4, solver, "jax", "cpu", "float64", 2, repeat, 0.0, 0.0, *ends, tuple(trace))
+    return Record(
+        problem,
+        "f",
+        2,
+        3,
+        4,
+        solver,
+        "jax",
+        "cpu",
+        "float64",
+        2,
+        repeat,
+        0.0,
+        0.0,
+        *ends,
+        tuple(trace),
+    )
 
 
 FAST = make_record("p", "fast", [1000.0, 200.0, 100.05, 100.0])
@@ -55,7 +74,9 @@ def test_best_cost_is_the_lowest_accepted_cost_of_any_solver():
 
 
 def test_of_a_float32_run_only_the_final_cost_counts_which_is_computed_in_float64():
-    rough = replace(make_record("p", "rough", [1000.0, 99.99, 99.98]), dtype="float32", final_cost=100.01)
+    rough = replace(
+        make_record("p", "rough", [1000.0, 99.99, 99.98]), dtype="float32", final_cost=100.01
+    )
     assert profile.best_cost([FAST, rough]) == {"p": 100.0}
     assert profile.best_cost([FAST, replace(rough, final_cost=99.0)]) == {"p": 99.0}
 
@@ -65,7 +86,9 @@ def test_non_finite_costs_are_never_best_and_never_reached():
     assert profile.best_cost([broken, FAST]) == {"p": 100.0}
     assert profile.first(broken, 1e9) == Reached(math.inf, math.inf)
     assert math.isnan(profile.best_cost([broken])["p"])
-    assert profile.reach_table([broken], Target("tau", 0.1))["broken"]["p"] == Reached(math.inf, math.inf)
+    assert profile.reach_table([broken], Target("tau", 0.1))["broken"]["p"] == Reached(
+        math.inf, math.inf
+    )
 
 
 def test_start_below_the_threshold_counts_as_iteration_zero():
@@ -91,7 +114,8 @@ def test_converging_after_the_limit_is_a_failure():
 
 
 def test_the_solver_and_the_benchmark_agree_about_what_is_converged():
-    from jaxba.solver.solve import Termination  # here, so that the pure functions are tested without the solver
+    # here, so that the pure functions are tested without the solver
+    from jaxba.solver.solve import Termination
 
     for reason in Termination:
         assert profile.converged(replace(FAST, termination=reason.name.lower())) == reason.converged
@@ -100,14 +124,21 @@ def test_the_solver_and_the_benchmark_agree_about_what_is_converged():
 
 def test_repeats_are_combined_by_their_median_and_half_failed_is_failed():
     def repeats(*steps):
-        return [make_record("p", "a", [1000.0, 100.0], step_s=step, repeat=i) for i, step in enumerate(steps)]
+        return [
+            make_record("p", "a", [1000.0, 100.0], step_s=step, repeat=i)
+            for i, step in enumerate(steps)
+        ]
 
-    assert profile.reach_table(repeats(5.0, 1.0, 2.0), Target("converged"))["a"]["p"] == Reached(1.0, 2.0)
+    assert profile.reach_table(repeats(5.0, 1.0, 2.0), Target("converged"))["a"]["p"] == Reached(
+        1.0, 2.0
+    )
     failed = make_record("p", "a", [1000.0, 1000.0], repeat=9, termination="max_iterations")
     two_of_three = [*repeats(1.0, 3.0), failed]
     assert profile.reach_table(two_of_three, Target("converged"))["a"]["p"] == Reached(1.0, 3.0)
     one_of_two = [*repeats(1.0), failed]
-    assert profile.reach_table(one_of_two, Target("converged"))["a"]["p"] == Reached(math.inf, math.inf)
+    assert profile.reach_table(one_of_two, Target("converged"))["a"]["p"] == Reached(
+        math.inf, math.inf
+    )
 
 
 def test_profile_with_a_tie_a_failure_and_a_problem_that_no_solver_solves():

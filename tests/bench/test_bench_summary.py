@@ -14,12 +14,25 @@ from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record, TracePoint
 
 
-def make_record(problem, solver, iterations, *, per_iteration_s=1.0, end=100.0, repeat=0, termination="ftol", failed=0):
-    """A run that falls to `end` in its last iteration; the first `failed` iterations are failed linear solves."""
+def make_record(
+    problem,
+    solver,
+    iterations,
+    *,
+    per_iteration_s=1.0,
+    end=100.0,
+    repeat=0,
+    termination="ftol",
+    failed=0,
+):
+    """A run that falls to `end` in its last iteration; the first `failed` iterations are failed
+    linear solves."""
     trace = [TracePoint(0, 0.0, 1000.0, math.nan, True, 0, math.nan)]
     for i in range(1, iterations + 1):
         cost, ok = (end, True) if i == iterations else (1000.0, False)
-        trace.append(TracePoint(i, i * per_iteration_s, cost, 1e-3, ok, 0, math.nan if i <= failed else 0.5))
+        trace.append(
+            TracePoint(i, i * per_iteration_s, cost, 1e-3, ok, 0, math.nan if i <= failed else 0.5)
+        )
     counts = (iterations, 1, 0, termination)
     times = (0.25, 3.0, 3.25 + trace[-1].time_s)
     start = (problem, "f", 2, 3, 4, solver, "jax", "cpu", "float64", 2, repeat)
@@ -28,7 +41,8 @@ def make_record(problem, solver, iterations, *, per_iteration_s=1.0, end=100.0, 
 
 @pytest.fixture
 def records():
-    """Three problems. learned: 2, 8 iterations, fails on c; classic: 16, 4, 25; ceres was not run on c."""
+    """Three problems. learned: 2, 8 iterations, fails on c; classic: 16, 4, 25; ceres was not run
+    on c."""
     return [
         make_record("a", "classic", 16),
         make_record("b", "classic", 4),
@@ -37,7 +51,9 @@ def records():
         make_record("b", "ceres", 4),
         make_record("a", "learned", 2, per_iteration_s=2.0, end=100.5),
         make_record("b", "learned", 8, per_iteration_s=2.0, failed=3),
-        make_record("c", "learned", 100, per_iteration_s=2.0, end=400.0, termination="max_iterations"),
+        make_record(
+            "c", "learned", 100, per_iteration_s=2.0, end=400.0, termination="max_iterations"
+        ),
     ]
 
 
@@ -81,7 +97,10 @@ def test_cells_hold_medians_over_repeats():
 
 
 def test_solver_that_fails_everywhere_has_no_mean_but_a_capped_one():
-    records = [make_record("a", "x", 100, end=900.0, termination="max_iterations"), make_record("a", "classic", 5)]
+    records = [
+        make_record("a", "x", 100, end=900.0, termination="max_iterations"),
+        make_record("a", "classic", 5),
+    ]
     end = solver(summarize(records), "x").targets["converged"]
     assert (end.reached, end.iterations_capped) == (0, pytest.approx(100.0))
     assert math.isnan(end.iterations)

@@ -37,7 +37,9 @@ def alone(game):
 
 def test_the_base_policy_takes_the_iterations_that_it_takes_in_an_evaluation(game, alone):
     bank, rules = game.bank, game.config
-    run = play(KIND, bank, POLICY, CONFIG.step_options(StepOptions()), rules.max_iterations, ftol=0.0)
+    run = play(
+        KIND, bank, POLICY, CONFIG.step_options(StepOptions()), rules.max_iterations, ftol=0.0
+    )
     reached = reach(run.costs[:, 1:], np.asarray(bank.best_cost), rules.tolerance) + 1
     np.testing.assert_array_equal(alone[0], np.minimum(reached, rules.max_iterations))
     np.testing.assert_array_equal(alone[1], np.isfinite(reached))
@@ -53,6 +55,8 @@ def test_it_takes_no_more_than_its_base_and_fewer_somewhere(game, alone):
 def test_its_first_numbers_are_those_of_the_whole_episodes(game, alone):
     """The base policy's own action leads to what it takes alone."""
     bank = game.bank
-    found = jax.jit(lambda scene: play_on(game, bank, POLICY, jnp.zeros((1, 1)), game.start(bank, scene)))
+    found = jax.jit(
+        lambda scene: play_on(game, bank, POLICY, jnp.zeros((1, 1)), game.start(bank, scene))
+    )
     for scene in range(3):
         assert found(jnp.asarray(scene, jnp.int32))[0] == alone[0][scene]

@@ -1,4 +1,5 @@
-"""The report in a browser: it sorts, hovers and switches, without errors and without the network."""
+"""The report in a browser: it sorts, hovers and switches, without errors and without the
+network."""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ from jaxba.bench.summary import summarize
 pytestmark = pytest.mark.extra
 
 RUNS = {"classic": (30, 0.8), "ceres": (14, 0.5), "a<b>&": (12, 0.3), "twin": (12, 0.3)}
-RECORDS = [make_record(p, s, n, rate=r) for p in ("first", "<second>") for s, (n, r) in RUNS.items()]
+RECORDS = [
+    make_record(p, s, n, rate=r) for p in ("first", "<second>") for s, (n, r) in RUNS.items()
+]
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +49,18 @@ def click(page: Any, selector: str) -> None:
 def chart(page: Any, title: str) -> str:
     """Id of the chart under a title, the shown one."""
     code = (
-        "return [...document.querySelectorAll('figure')].find(f => f.querySelector('h3').textContent === arguments[0]"
+        "return [...document.querySelectorAll('figure')].find(f => "
+        "f.querySelector('h3').textContent === arguments[0]"
         " && !f.closest('[hidden]')).querySelector('div').id"
     )
     return page.execute_script(code, title)
 
 
 def traces(page: Any, name: str) -> dict[str, dict]:
-    code = "return document.getElementById(arguments[0]).data.map(t => ({meta: t.meta, x: t.x, y: t.y}))"
+    code = (
+        "return document.getElementById(arguments[0]).data.map(t => ({meta: t.meta, x: t.x, y: "
+        "t.y}))"
+    )
     return {trace["meta"]: trace for trace in page.execute_script(code, name)}
 
 
@@ -66,7 +73,8 @@ def pixels(page: Any, name: str) -> np.ndarray:
 
 def column(page: Any, title: str, number: int) -> list[str]:
     code = (
-        "return [...[...document.querySelectorAll('section')].find(s => s.querySelector('h2').textContent ==="
+        "return [...[...document.querySelectorAll('section')].find(s => "
+        "s.querySelector('h2').textContent ==="
         " arguments[0]).querySelectorAll('tbody tr')].map(r => r.cells[arguments[1]].textContent)"
     )
     return page.execute_script(code, title, number)
@@ -90,9 +98,12 @@ def test_the_switch_and_the_choice_of_problem_show_the_numbers_of_the_records(pa
     assert shown["y"] == pytest.approx([p.cost for p in record.trace], rel=1e-6)
     before = pixels(page, name)
     click(page, "[data-axis=time]")
-    assert traces(page, name)["ceres"]["x"] == pytest.approx([p.time_s for p in record.trace], rel=1e-6)
+    assert traces(page, name)["ceres"]["x"] == pytest.approx(
+        [p.time_s for p in record.trace], rel=1e-6
+    )
     page.execute_script(
-        "const s = document.getElementById('group'); s.value = '1'; s.dispatchEvent(new Event('change'))"
+        "const s = document.getElementById('group'); s.value = '1'; s.dispatchEvent(new "
+        "Event('change'))"
     )
     other = chart(page, "Accepted cost (pixels²)")
     assert other != name
@@ -106,10 +117,14 @@ def test_a_point_under_the_pointer_has_a_note_with_all_solvers_and_their_numbers
     name = chart(page, "Damping λ")
     code = "return [...document.querySelectorAll(`#${arguments[0]} .scatterlayer .trace`)].length"
     assert page.execute_script(code, name) == len(RUNS)
-    point = page.find_elements("css selector", f"#{name} .scatterlayer .trace:nth-child(3) .point")[2]
+    point = page.find_elements("css selector", f"#{name} .scatterlayer .trace:nth-child(3) .point")[
+        2
+    ]
     page.execute_script("arguments[0].scrollIntoView({block: 'center'})", point)
     ActionChains(page).move_to_element(point).perform()
-    text = page.execute_script("return document.querySelector(`#${arguments[0]} .hoverlayer`).textContent", name)
+    text = page.execute_script(
+        "return document.querySelector(`#${arguments[0]} .hoverlayer`).textContent", name
+    )
     assert "iteration: 3" in text
     assert all(f"{name} 3: cost " in text for name in RUNS)
 
@@ -120,11 +135,15 @@ def test_a_solver_is_hidden_in_every_chart_and_table(page):
     click(page, ".chip[data-key=ceres]")
     for title in ("τ = 0.1", "τ = 0.001", "f*(1+0.0001)", "Accepted cost (pixels²)", "Damping λ"):
         assert set(traces(page, chart(page, title))) == set(RUNS) - {"ceres"}
-    assert page.execute_script("return [...document.querySelectorAll('tr[data-key=ceres]')].every(r => r.hidden)")
+    assert page.execute_script(
+        "return [...document.querySelectorAll('tr[data-key=ceres]')].every(r => r.hidden)"
+    )
 
 
 def test_no_button_of_a_chart_sends_it_anywhere(page):
-    titles = page.execute_script("return [...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)")
+    titles = page.execute_script(
+        "return [...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)"
+    )
     assert set(titles) == {"Download plot", "Zoom", "Pan", "Reset axes"}
     made = "Plotly.toImage('chart0', {format: 'svg'}).then(arguments[0], arguments[0])"
     assert page.execute_async_script(made).startswith("data:image/svg+xml,")

@@ -1,4 +1,5 @@
-"""Short runs of the benchmarks that look for what must not happen; docs/results/robustness.md has long ones."""
+"""Short runs of the benchmarks that look for what must not happen; docs/results/robustness.md has
+long ones."""
 
 from __future__ import annotations
 
@@ -11,7 +12,12 @@ from benchmarks import invariants
 
 @pytest.mark.slow
 def test_no_cost_rises_and_every_number_is_finite(capsys):
-    assert invariants.main(["--scenes", "24", "--seed", "5", "--iterations", "12", "--solvers", "learned"]) == 0
+    assert (
+        invariants.main(
+            ["--scenes", "24", "--seed", "5", "--iterations", "12", "--solvers", "learned"]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     assert printed.count("everything holds") == 2
     assert "0 costs that rose" in printed

@@ -1,4 +1,5 @@
-"""The timing of a solve to a tolerance, as `python -m benchmarks.suite --only tolerance` does it."""
+"""The timing of a solve to a tolerance, as `python -m benchmarks.suite --only tolerance` does
+it."""
 
 from __future__ import annotations
 

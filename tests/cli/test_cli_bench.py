@@ -25,8 +25,28 @@ from jaxba.scenes import DEFAULT_SCENES
 from jaxba.structure.padding import capacity_of
 
 KEYS = [
-    *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
-    *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
+    *(
+        "problem",
+        "family",
+        "cameras",
+        "points",
+        "observations",
+        "solver",
+        "backend",
+        "device",
+        "dtype",
+        "threads",
+    ),
+    *(
+        "repeat",
+        "setup_s",
+        "compile_s",
+        "total_s",
+        "initial_cost",
+        "final_cost",
+        "iterations",
+        "accepted",
+    ),
     *("cg_iterations", "termination", "trace", "notes"),
 ]
 TRACE_KEYS = ["iteration", "time_s", "cost", "lambda", "accepted", "cg_iterations", "gain_ratio"]
@@ -87,7 +107,13 @@ def test_the_numbers_of_a_line_are_those_of_the_solve(finished):
         assert (line["cameras"], line["points"], line["observations"]) == (6, 40, 200)
         np.testing.assert_allclose(line["initial_cost"], geometry.cost(problem), rtol=1e-10)
         trace = line["trace"]
-        start = {"iteration": 0, "time_s": 0.0, "cost": line["initial_cost"], "lambda": None, "accepted": True}
+        start = {
+            "iteration": 0,
+            "time_s": 0.0,
+            "cost": line["initial_cost"],
+            "lambda": None,
+            "accepted": True,
+        }
         assert trace[0] == {**start, "cg_iterations": 0, "gain_ratio": None}
         assert [point["iteration"] for point in trace] == list(range(line["iterations"] + 1))
         assert line["iterations"] <= 5
@@ -106,7 +132,8 @@ def test_a_report_is_written(finished):
     assert text.startswith("<!DOCTYPE html>")
     assert "classic" in text
     assert (
-        f"<pre>jaxba-bench scene:tiny --solvers classic,ceres --repeats 1 --max-iterations 5 --out {finished}" in text
+        "<pre>jaxba-bench scene:tiny --solvers classic,ceres --repeats 1 --max-iterations 5 --out "
+        f"{finished}" in text
     )
 
 
@@ -140,7 +167,9 @@ def test_the_incomplete_line_of_a_killed_run_is_removed(folder, undrawn, capsys)
 
 
 @pytest.mark.parametrize(
-    "change", [["--max-iterations", "6"], ["--linear-solver", "implicit"]], ids=["max-iterations", "linear-solver"]
+    "change",
+    [["--max-iterations", "6"], ["--linear-solver", "implicit"]],
+    ids=["max-iterations", "linear-solver"],
 )
 def test_other_settings_may_not_continue_in_the_folder(change, folder, undrawn, capsys):
     before = (folder / "results.jsonl").read_bytes()
@@ -149,7 +178,9 @@ def test_other_settings_may_not_continue_in_the_folder(change, folder, undrawn, 
     assert (folder / "results.jsonl").read_bytes() == before
 
 
-def test_another_problem_of_the_same_name_may_not_continue_in_the_folder(folder, tmp_path, undrawn, capsys):
+def test_another_problem_of_the_same_name_may_not_continue_in_the_folder(
+    folder, tmp_path, undrawn, capsys
+):
     path = tmp_path / "tiny.txt"
     write_bal(support.paper(0), path)
     check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another tiny")
@@ -159,7 +190,10 @@ def changed_file(folder: Path) -> Path:
     """A file that has changed since the folder got results of it."""
     path = folder.parent / "one.txt"
     write_bal(support.tiny(), path)
-    assert bench(folder, str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "5") == 0
+    assert (
+        bench(folder, str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "5")
+        == 0
+    )
     write_bal(support.tiny().replace(points=support.tiny().points + 0.01), path)
     return path
 
@@ -189,10 +223,14 @@ def test_another_policy_in_the_same_file_may_not_continue_in_the_folder(folder, 
 def test_the_error_names_a_damaged_result_file_and_its_line(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(b"no json\n" + path.read_bytes())
-    check_one_line(bench(folder, "scene:tiny", *BRIEF), capsys.readouterr().err, "results.jsonl, line 1")
+    check_one_line(
+        bench(folder, "scene:tiny", *BRIEF), capsys.readouterr().err, "results.jsonl, line 1"
+    )
 
 
-def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undrawn, capsys, monkeypatch):
+def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(
+    tmp_path, undrawn, capsys, monkeypatch
+):
     solve_one = bench_run.run_solver
     done = []
 
@@ -234,14 +272,18 @@ def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     assert "2 of 2 runs already in" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("module", "writer"), [(bench_run.json_lines, "append"), (report, "write_report")])
+@pytest.mark.parametrize(
+    ("module", "writer"), [(bench_run.json_lines, "append"), (report, "write_report")]
+)
 def test_a_full_disk_is_one_line_and_status_2(module, writer, tmp_path, capsys, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(module, writer, full)
     status = bench(tmp_path / "run", "scene:tiny", *BRIEF)
-    check_one_line(status, capsys.readouterr().err, f"--out {tmp_path / 'run'}: No space left on device")
+    check_one_line(
+        status, capsys.readouterr().err, f"--out {tmp_path / 'run'}: No space left on device"
+    )
 
 
 def test_every_repeat_has_its_line(tmp_path, undrawn, capsys):
@@ -255,7 +297,9 @@ def test_every_repeat_has_its_line(tmp_path, undrawn, capsys):
 # Problems and suites
 
 
-def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(tmp_path, undrawn, capsys):
+def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(
+    tmp_path, undrawn, capsys
+):
     good, bad = tmp_path / "good.txt", tmp_path / "bad.txt"
     write_bal(support.tiny(), good)
     bad.write_bytes(good.read_bytes()[:500])
@@ -277,7 +321,9 @@ def test_a_bad_file_that_was_repaired_is_solved_in_the_same_folder(tmp_path, und
     assert sorted({line["problem"] for line in lines(folder)}) == ["bad", "good"]
 
 
-def test_a_solver_that_runs_out_of_memory_is_reported_and_others_are_done(tmp_path, undrawn, capsys, monkeypatch):
+def test_a_solver_that_runs_out_of_memory_is_reported_and_others_are_done(
+    tmp_path, undrawn, capsys, monkeypatch
+):
     def greedy(problem, source, solver, *arguments):
         if str(solver) == "classic":
             raise MemoryError
@@ -324,7 +370,17 @@ def test_a_problem_that_is_named_twice_is_one(tmp_path, undrawn, capsys):
     path = tmp_path / "tiny.txt"
     write_bal(support.tiny(), path)
     argv = ["--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
-    assert bench(tmp_path / "run", str(path), str(tmp_path / "." / "tiny.txt"), "scene:tiny", "scene:tiny", *argv) == 0
+    assert (
+        bench(
+            tmp_path / "run",
+            str(path),
+            str(tmp_path / "." / "tiny.txt"),
+            "scene:tiny",
+            "scene:tiny",
+            *argv,
+        )
+        == 0
+    )
     assert [line["family"] for line in lines(tmp_path / "run")] == [tmp_path.name, "scene"]
 
 
@@ -383,7 +439,9 @@ def test_a_rule_in_a_file_is_run_like_others_and_its_fault_is_one_line(tmp_path,
     assert refined["trace"][1]["cost"] < own["trace"][1]["cost"]
     path.write_text(RULES + "# changed\n")
     check_one_line(
-        bench(tmp_path / "run", "scene:tiny", "--solvers", names[0], *BRIEF[2:]), capsys.readouterr().err, "another"
+        bench(tmp_path / "run", "scene:tiny", "--solvers", names[0], *BRIEF[2:]),
+        capsys.readouterr().err,
+        "another",
     )
 
 
@@ -399,10 +457,16 @@ BAD_RULES = {
 def test_a_class_that_is_no_rule_is_one_line_and_status_2(name, tmp_path, capsys):
     path = tmp_path / "rules.py"
     path.write_text(RULES)
-    check_one_line(bench(tmp_path / "run", "--solvers", f"{path}:{name}"), capsys.readouterr().err, BAD_RULES[name])
+    check_one_line(
+        bench(tmp_path / "run", "--solvers", f"{path}:{name}"),
+        capsys.readouterr().err,
+        BAD_RULES[name],
+    )
     path.write_text("1 +")
     check_one_line(
-        bench(tmp_path / "run", "--solvers", f"{path}:{name}"), capsys.readouterr().err, "rules.py: SyntaxError"
+        bench(tmp_path / "run", "--solvers", f"{path}:{name}"),
+        capsys.readouterr().err,
+        "rules.py: SyntaxError",
     )
 
 
@@ -421,26 +485,45 @@ def test_wildcards_and_variables_in_a_suite_are_expanded(tmp_path, undrawn, caps
     path = suite(tmp_path, **entries, tolerance=0.01, repeats=1, max_iterations=1)
     assert bench(tmp_path / "run", "--suite", path) == 0
     assert [line["problem"] for line in lines(tmp_path / "run")] == ["one", "two", "tiny"]
-    (tmp_path / "suite.yaml").write_text(yaml.safe_dump(entries) + "tolerance: 1e-2\nrepeats: 1\nmax_iterations: 1\n")
+    (tmp_path / "suite.yaml").write_text(
+        yaml.safe_dump(entries) + "tolerance: 1e-2\nrepeats: 1\nmax_iterations: 1\n"
+    )
     assert bench(tmp_path / "run", "--suite", path) == 0
     assert bench(tmp_path / "other", "scene:tiny", "--suite", path, "--solvers", "classic") == 0
-    assert [(line["problem"], line["solver"]) for line in lines(tmp_path / "other")] == [("tiny", "classic")]
+    assert [(line["problem"], line["solver"]) for line in lines(tmp_path / "other")] == [
+        ("tiny", "classic")
+    ]
 
 
 BAD = {
-    "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
+    "unknown solver": (
+        ["scene:tiny", "--solvers", "ceres,cerse"],
+        "unknown damping policy 'cerse'",
+    ),
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
-    "mixed types of a method": (["scene:tiny", "--solvers", "ceres,stba+ceres@mixed"], "mixed types are for plain LM"),
+    "mixed types of a method": (
+        ["scene:tiny", "--solvers", "ceres,stba+ceres@mixed"],
+        "mixed types are for plain LM",
+    ),
     "missing rule": (["scene:tiny", "--solvers", "no.py:Rule"], "no.py: No such file"),
-    "missing policy": (["scene:tiny", "--solvers", "no.safetensors"], "no.safetensors: No such file"),
+    "missing policy": (
+        ["scene:tiny", "--solvers", "no.safetensors"],
+        "no.safetensors: No such file",
+    ),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),
     "directory": (["."], "a directory without a COLMAP model"),
     "unknown scene": (["scene:none"], "no scene is called 'none'"),
     "bad seed": (["scene:tiny:x"], "the seed must be a whole number"),
     "no repeats": (["scene:tiny", "--repeats", "0"], "--repeats must be positive"),
-    "no iterations": (["scene:tiny", "--max-iterations", "-1"], "--max-iterations must be positive"),
-    "too many iterations": (["scene:tiny", "--max-iterations", "10000000000"], "at most 2147483647"),
+    "no iterations": (
+        ["scene:tiny", "--max-iterations", "-1"],
+        "--max-iterations must be positive",
+    ),
+    "too many iterations": (
+        ["scene:tiny", "--max-iterations", "10000000000"],
+        "at most 2147483647",
+    ),
     "tolerance 0": (["scene:tiny", "--tolerance", "0"], "--tolerance must lie between 0 and 1"),
     "tolerance 1": (["scene:tiny", "--tolerance", "1"], "--tolerance must lie between 0 and 1"),
     "missing suite": (["--suite", "no-such-suite.yaml"], "No such file"),
@@ -459,7 +542,16 @@ def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tmp_pat
 
 
 def test_a_suite_is_found_by_its_name(tmp_path, undrawn, capsys):
-    status = bench(tmp_path / "run", "scene:tiny", "--suite", "synthetic", "--repeats", "1", "--max-iterations", "1")
+    status = bench(
+        tmp_path / "run",
+        "scene:tiny",
+        "--suite",
+        "synthetic",
+        "--repeats",
+        "1",
+        "--max-iterations",
+        "1",
+    )
     assert status == 0
     assert [line["solver"] for line in lines(tmp_path / "run")] == [
         "classic",
@@ -472,7 +564,9 @@ def test_a_suite_is_found_by_its_name(tmp_path, undrawn, capsys):
 
 def test_the_error_names_the_variable_of_the_folder_of_real_problems(tmp_path, monkeypatch, capsys):
     wanted = (
-        "--suite rules: $JAXBA_DATA/bal/problem-*.bz2: the environment variable JAXBA_DATA, a folder of problems, is"
+        "--suite rules: $JAXBA_DATA/bal/problem-*.bz2: the environment variable JAXBA_DATA, "
+        "a "
+        "folder of problems, is"
     )
     for value in (None, ""):
         monkeypatch.delenv("JAXBA_DATA", raising=False)
@@ -487,15 +581,27 @@ def test_the_error_names_the_variable_of_the_folder_of_real_problems(tmp_path, m
 BAD_SUITES = {
     "unknown key": ({"problem": ["scene:tiny"]}, "unknown key problem; did you mean problems?"),
     "wrong type": ({"problems": "scene:tiny"}, "problems must be a list, is 'scene:tiny'"),
-    "wrong number": ({"problems": ["scene:tiny"], "repeats": 1.5}, "repeats must be a whole number, is 1.5"),
-    "truth as number": ({"problems": ["scene:tiny"], "repeats": True}, "repeats must be a whole number, is True"),
+    "wrong number": (
+        {"problems": ["scene:tiny"], "repeats": 1.5},
+        "repeats must be a whole number, is 1.5",
+    ),
+    "truth as number": (
+        {"problems": ["scene:tiny"], "repeats": True},
+        "repeats must be a whole number, is True",
+    ),
     "unset variable": (
         {"problems": ["$JAXBA_NO_SUCH_VARIABLE/x.txt"]},
         "/x.txt: the environment variable JAXBA_NO_SUCH_VARIABLE, a folder of problems, is not set",
     ),
     "glob without match": ({"problems": ["no-such-folder/*.txt"]}, "no such file"),
-    "unknown solver": ({"problems": ["scene:tiny"], "solvers": ["cerse"]}, "unknown damping policy"),
-    "bad tolerance": ({"problems": ["scene:tiny"], "tolerance": 2.0}, "--tolerance must lie between 0 and 1"),
+    "unknown solver": (
+        {"problems": ["scene:tiny"], "solvers": ["cerse"]},
+        "unknown damping policy",
+    ),
+    "bad tolerance": (
+        {"problems": ["scene:tiny"], "tolerance": 2.0},
+        "--tolerance must lie between 0 and 1",
+    ),
 }
 
 

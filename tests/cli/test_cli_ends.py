@@ -20,12 +20,16 @@ from jaxba.runtime.interrupt import Interrupt
 
 COMMANDS = ("solve", "bench", "train", "data", "kitti", "paper")
 START = "import sys; sys.argv[0] = 'jaxba-{0}'; {1}from jaxba.cli.{0} import main; main()"
-linux = pytest.mark.skipif(sys.platform != "linux", reason="other systems have other pipes and no /dev/full")
+linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems have other pipes and no /dev/full"
+)
 
 
 def begin(command: str, *arguments: str, before: str = "", **streams) -> subprocess.Popen[str]:
     given = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
-    return subprocess.Popen([sys.executable, "-c", START.format(command, before), *arguments], text=True, **given)
+    return subprocess.Popen(
+        [sys.executable, "-c", START.format(command, before), *arguments], text=True, **given
+    )
 
 
 @linux
@@ -44,7 +48,9 @@ def test_help_into_a_pipe_that_nobody_reads_is_no_error(command):
 def test_a_full_output_is_one_line(arguments):
     with open("/dev/full", "w") as full:
         child = begin("data", *arguments, stdout=full)
-        assert child.communicate(timeout=100)[1] == "error: standard output: No space left on device\n"
+        assert (
+            child.communicate(timeout=100)[1] == "error: standard output: No space left on device\n"
+        )
     assert child.returncode == 2
 
 
@@ -62,7 +68,9 @@ def test_a_closed_terminal_hides_errors_and_keeps_the_status():
 def test_a_solve_whose_output_nobody_reads_writes_its_file(tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
-    child = begin("solve", "--max-iterations", "1", "--output", str(tmp_path / "out.txt"), stdout=writer)
+    child = begin(
+        "solve", "--max-iterations", "1", "--output", str(tmp_path / "out.txt"), stdout=writer
+    )
     os.close(writer)
     assert child.communicate(timeout=200)[1] == ""
     assert child.returncode == 0
@@ -102,7 +110,9 @@ def test_a_signal_that_is_ignored_stays_ignored():
 
 @linux
 def test_a_program_that_imports_jaxba_keeps_its_own_handler():
-    code = "import signal, jaxba; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    code = (
+        "import signal, jaxba; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout == "True\n"
 
@@ -162,7 +172,11 @@ def test_streams_are_those_of_before_afterwards():
 
 
 def test_one_is_singular():
-    assert [common.counted(n, "iteration") for n in (0, 1, 2)] == ["0 iterations", "1 iteration", "2 iterations"]
+    assert [common.counted(n, "iteration") for n in (0, 1, 2)] == [
+        "0 iterations",
+        "1 iteration",
+        "2 iterations",
+    ]
 
 
 @linux

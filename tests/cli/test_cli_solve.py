@@ -37,8 +37,28 @@ from jaxba.solver import progress
 from jaxba.solver.record import Record
 
 RECORD_KEYS = [
-    *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
-    *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
+    *(
+        "problem",
+        "family",
+        "cameras",
+        "points",
+        "observations",
+        "solver",
+        "backend",
+        "device",
+        "dtype",
+        "threads",
+    ),
+    *(
+        "repeat",
+        "setup_s",
+        "compile_s",
+        "total_s",
+        "initial_cost",
+        "final_cost",
+        "iterations",
+        "accepted",
+    ),
     *("cg_iterations", "termination", "trace", "notes"),
 ]
 
@@ -84,12 +104,18 @@ def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
     np.testing.assert_allclose(record["final_cost"], geometry.cost(solved), rtol=1e-10)
     for name in ("observations", "camera_index", "point_index"):
         assert np.array_equal(getattr(solved, name), getattr(support.tiny(), name))
-    assert (record["solver"], record["dtype"], record["termination"]) == ("guarded", "float64", "cost")
+    assert (record["solver"], record["dtype"], record["termination"]) == (
+        "guarded",
+        "float64",
+        "cost",
+    )
     assert (record["cameras"], record["points"], record["observations"]) == (6, 40, 200)
     costs = [point["cost"] for point in record["trace"]]
     assert costs[0] == record["initial_cost"]
     assert costs[-1] == record["final_cost"]
-    assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
+    assert [point["iteration"] for point in record["trace"]] == list(
+        range(record["iterations"] + 1)
+    )
     assert json_lines.from_plain(Record, record).accepted == record["iterations"]
     assert "6 cameras, 40 points, 200 observations" in printed.out
     assert "converged: relative decrease" in printed.out
@@ -113,21 +139,30 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
 def test_a_search_for_points_is_reported_and_rows_are_numbered_consecutively(tmp_path, capsys):
     """One point behind its cameras, with which the solve alone converges far above the minimum."""
     problem, log = solve(support.tiny()).problem, tmp_path / "log.json"
-    points, center = np.array(problem.points), geometry.camera_centers(problem.cameras)[problem.camera_index[0]]
+    points, center = (
+        np.array(problem.points),
+        geometry.camera_centers(problem.cameras)[problem.camera_index[0]],
+    )
     points[0] = center - 3 * (points[0] - center)
     write_bal(problem.replace(points=points), tmp_path / "strayed.txt")
     stranding = ["--policy", "ceres", "--refine-points", "3"]
-    assert run([str(tmp_path / "strayed.txt"), *stranding, "--retriangulate", "--log", str(log)]) == 0
+    assert (
+        run([str(tmp_path / "strayed.txt"), *stranding, "--retriangulate", "--log", str(log)]) == 0
+    )
     printed, record = capsys.readouterr().out, json.loads(log.read_text())
     searches = re.findall(
-        r"^   search for points at other depths: (\d+) of 40 points moved, cost (.*) -> (.*)$", printed, re.M
+        r"^   search for points at other depths: (\d+) of 40 points moved, cost (.*) -> (.*)$",
+        printed,
+        re.M,
     )
     assert len(searches) >= 1
     assert int(searches[0][0]) > 0
     assert float(searches[0][2]) < float(searches[0][1])
     assert "   search for points at other depths: none found\nconverged" in printed
     assert [int(line[0]) for line in rows(printed)] == list(range(record["iterations"] + 1))
-    assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
+    assert [point["iteration"] for point in record["trace"]] == list(
+        range(record["iterations"] + 1)
+    )
     np.testing.assert_allclose(record["final_cost"], geometry.cost(problem), rtol=1e-5)
 
 
@@ -137,14 +172,20 @@ def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path
     assert run([str(tiny), "--loss", loss, "--max-iterations", "3", "--output", str(output)]) == 0
     found = re.search(r"\(rms (.*) -> (.*) px\)", capsys.readouterr().out)
     assert found
-    rms = [np.sqrt(np.mean(np.sum(geometry.residuals(read_bal(path)) ** 2, axis=1))) for path in (tiny, output)]
+    rms = [
+        np.sqrt(np.mean(np.sum(geometry.residuals(read_bal(path)) ** 2, axis=1)))
+        for path in (tiny, output)
+    ]
     np.testing.assert_allclose([float(number) for number in found.groups()], rms, rtol=1e-3)
 
 
 def test_padded_sizes_are_reported(tiny, capsys):
     fast = [str(tiny), "--max-iterations", "1", "--policy", "ceres", "--pad", "yes"]
     assert run(fast) == 0
-    assert "padded to 8 cameras, 256 points, 1024 observations, 6144 pairs\n" in capsys.readouterr().out
+    assert (
+        "padded to 8 cameras, 256 points, 1024 observations, 6144 pairs\n"
+        in capsys.readouterr().out
+    )
     assert run([*fast, "--linear-solver", "implicit"]) == 0
     assert "padded to" not in capsys.readouterr().out
 
@@ -160,7 +201,20 @@ def test_the_iteration_limit_is_reported_and_not_an_error(tiny, tmp_path, capsys
 
 def test_without_iterations_the_cost_is_printed_and_the_problem_converted(tiny, tmp_path, capsys):
     output, model = tmp_path / "same.txt", tmp_path / "model"
-    assert run([str(tiny), "--max-iterations", "0", "--output", str(output), "--record", f"{tmp_path}/r.npz"]) == 0
+    assert (
+        run(
+            [
+                str(tiny),
+                "--max-iterations",
+                "0",
+                "--output",
+                str(output),
+                "--record",
+                f"{tmp_path}/r.npz",
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     cost = f"{geometry.cost(support.tiny()):.6e}"
     assert f"not converged: iteration limit\ncost {cost} -> {cost} " in printed
@@ -176,9 +230,13 @@ def test_a_problem_comes_in_and_goes_out_by_the_standard_streams(tmp_path):
         given = file.read()
     code = "from jaxba.cli.solve import main; main()"
     words = ["-", "--max-iterations", "0", "--output", "-"]
-    ran = subprocess.run([sys.executable, "-c", code, *words], input=given, capture_output=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", code, *words], input=given, capture_output=True, check=True
+    )
     (tmp_path / "solved.txt").write_bytes(ran.stdout)
-    np.testing.assert_allclose(read_bal(tmp_path / "solved.txt").cameras, support.tiny().cameras, rtol=1e-12)
+    np.testing.assert_allclose(
+        read_bal(tmp_path / "solved.txt").cameras, support.tiny().cameras, rtol=1e-12
+    )
     assert b"/dev/stdin: 6 cameras, 40 points" in ran.stderr
 
 
@@ -203,7 +261,16 @@ def test_the_point_cloud_has_every_point_and_camera(tiny, tmp_path, capsys):
 @pytest.mark.slow
 def test_options_reach_the_solver(tiny, tmp_path, capsys):
     log = tmp_path / "log.json"
-    options = ["--policy", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]
+    options = [
+        "--policy",
+        "classic:0.03",
+        "--refine-points",
+        "3",
+        "--max-iterations",
+        "3",
+        "--log",
+        str(log),
+    ]
     assert run([str(tiny), *options]) == 0
     record = json.loads(log.read_text())
     assert record["solver"] == "classic:0.03+refine3"
@@ -212,11 +279,29 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     assert run([str(tiny), "--dtype", "float32", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
     assert (record["solver"], record["dtype"]) == ("guarded@float32", "float32")
-    assert run([str(tiny), "--linear-solver", "implicit", "--max-iterations", "2", "--log", str(log)]) == 0
+    assert (
+        run([str(tiny), "--linear-solver", "implicit", "--max-iterations", "2", "--log", str(log)])
+        == 0
+    )
     record = json.loads(log.read_text())
     assert record["cg_iterations"] > 0
     assert record["backend"].endswith("(implicit)")
-    assert run([str(tiny), "--method", "stba:3", "--policy", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
+    assert (
+        run(
+            [
+                str(tiny),
+                "--method",
+                "stba:3",
+                "--policy",
+                "stba",
+                "--max-iterations",
+                "2",
+                "--log",
+                str(log),
+            ]
+        )
+        == 0
+    )
     assert json.loads(log.read_text())["solver"] == "stba:3+stba"
     assert "method stba:3" in capsys.readouterr().out
 
@@ -233,7 +318,9 @@ def test_an_option_of_the_step_leaves_the_others_as_the_policy_was_trained():
     _, turned = solve_options(Arguments(rotation="manifold", refine_points=2))
     assert turned.coordinates == replace(trained.coordinates, rotation="manifold")
     assert turned.refinement == Refinement(points=2)
-    assert replace(turned, coordinates=trained.coordinates, refinement=trained.refinement) == trained
+    assert (
+        replace(turned, coordinates=trained.coordinates, refinement=trained.refinement) == trained
+    )
 
 
 def test_fixed_intrinsics_are_bitwise_unchanged_and_the_rest_is_optimised(tiny, tmp_path):
@@ -261,7 +348,8 @@ def test_notes_on_the_data_have_the_right_counts(tmp_path, capsys):
         "note: 1 camera without observations; poses stay as they are",
         "note: 2 points without observations; positions stay as they are",
         f"note: {once} points seen once; damping alone fixes the depth",
-        f"note: observations behind their camera: 1 at the start, 0 at the end (most of camera {behind[0]})",
+        "note: observations behind their camera: 1 at the start, 0 at the end (most of camera "
+        f"{behind[0]})",
     ]
 
 
@@ -277,7 +365,9 @@ def test_an_existing_output_is_replaced(tiny, tmp_path, capsys):
     assert read_bal(output).num_cameras == 6
 
 
-def test_a_file_that_is_replaced_keeps_its_permissions_and_a_read_only_one_is_refused(tiny, tmp_path, capsys):
+def test_a_file_that_is_replaced_keeps_its_permissions_and_a_read_only_one_is_refused(
+    tiny, tmp_path, capsys
+):
     output = tmp_path / "out.txt"
     output.write_text("old")
     output.chmod(0o600)
@@ -313,7 +403,9 @@ def test_a_start_without_a_finite_cost_is_reported(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_stops_after_the_iteration_and_writes_the_solution(number, tiny, tmp_path, capsys, monkeypatch):
+def test_a_signal_stops_after_the_iteration_and_writes_the_solution(
+    number, tiny, tmp_path, capsys, monkeypatch
+):
     output = tmp_path / "out.txt"
     row = progress.row
 
@@ -366,7 +458,10 @@ def test_a_name_that_stdout_cannot_encode_is_printed_escaped(tmp_path, monkeypat
 
 
 def test_outputs_may_be_devices_and_streams(tiny, capfd):
-    assert run([str(tiny), "--max-iterations", "1", "--output", "/dev/null", "--log", "/dev/stdout"]) == 0
+    assert (
+        run([str(tiny), "--max-iterations", "1", "--output", "/dev/null", "--log", "/dev/stdout"])
+        == 0
+    )
     assert '"problem"' in capfd.readouterr().out
 
 
@@ -454,35 +549,77 @@ BAD = {
     "empty directory": (lambda tiny: [str(empty(tiny))], "directory"),
     "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
-    "unknown policy": (lambda tiny: [str(tiny), "--policy", "cerse"], "unknown damping policy 'cerse'"),
-    "lambda that is no number": (lambda tiny: [str(tiny), "--policy", "constant:x"], "positive number"),
-    "missing policy": (lambda tiny: [str(tiny), "--policy", "no.safetensors"], "no.safetensors: No such file"),
-    "policy that is none": (lambda tiny: [str(tiny), "--policy", str(garbage(tiny))], "not a safetensors file"),
+    "unknown policy": (
+        lambda tiny: [str(tiny), "--policy", "cerse"],
+        "unknown damping policy 'cerse'",
+    ),
+    "lambda that is no number": (
+        lambda tiny: [str(tiny), "--policy", "constant:x"],
+        "positive number",
+    ),
+    "missing policy": (
+        lambda tiny: [str(tiny), "--policy", "no.safetensors"],
+        "no.safetensors: No such file",
+    ),
+    "policy that is none": (
+        lambda tiny: [str(tiny), "--policy", str(garbage(tiny))],
+        "not a safetensors file",
+    ),
     "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm"),
     "size of no clusters": (lambda tiny: [str(tiny), "--method", "deeplm:3"], "no clusters"),
-    "solver of a method": (lambda tiny: [str(tiny), "--method", "deeplm", "--linear-solver", "sparse"], "has its own"),
-    "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
-    "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
+    "solver of a method": (
+        lambda tiny: [str(tiny), "--method", "deeplm", "--linear-solver", "sparse"],
+        "has its own",
+    ),
+    "negative refinement": (
+        lambda tiny: [str(tiny), "--refine-points", "-1"],
+        "--refine-points must be at least 0",
+    ),
+    "learned in another unit": (
+        lambda tiny: [str(tiny), "--scaling", "identity"],
+        "not with scaling 'identity'",
+    ),
     "mixed types of a method": (
         lambda tiny: [str(tiny), "--method", "stba", "--dtype", "mixed"],
         "mixed types are for plain LM",
     ),
-    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 0"),
-    "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
+    "negative iterations": (
+        lambda tiny: [str(tiny), "--max-iterations", "-3"],
+        "--max-iterations must be at least 0",
+    ),
+    "too many iterations": (
+        lambda tiny: [str(tiny), "--max-iterations", "10000000000"],
+        "at most 2147483647",
+    ),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
-    "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
-    "negative xtol": (lambda tiny: [str(tiny), "--xtol", "-1"], "--xtol must not be negative, is -1"),
+    "ftol that is no number": (
+        lambda tiny: [str(tiny), "--ftol", "nan"],
+        "--ftol must not be negative",
+    ),
+    "negative xtol": (
+        lambda tiny: [str(tiny), "--xtol", "-1"],
+        "--xtol must not be negative, is -1",
+    ),
     "loss without scale": (
         lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"],
         "--loss-scale must be positive",
     ),
-    "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
-    "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "holds other files"),
+    "output in a missing folder": (
+        lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")],
+        "--output",
+    ),
+    "output is a directory": (
+        lambda tiny: [str(tiny), "--output", str(tiny.parent)],
+        "holds other files",
+    ),
     "output in a missing directory": (
         lambda tiny: [str(tiny), "--output", f"{tiny.parent}/no/new/"],
         "no does not exist",
     ),
-    "gain ratio that no step exceeds": (lambda tiny: [str(tiny), "--min-gain", "1"], "--min-gain must be at least 0"),
+    "gain ratio that no step exceeds": (
+        lambda tiny: [str(tiny), "--min-gain", "1"],
+        "--min-gain must be at least 0",
+    ),
     "compressed output of another format": (
         lambda tiny: [str(tiny), "--output", "o.zip.gz"],
         "cannot write o.zip.gz: files with .zip",
@@ -491,7 +628,10 @@ BAD = {
         lambda tiny: [str(tiny), "--log", f"{tiny.parent}/../in/tiny.txt"],
         "is a file of the problem",
     ),
-    "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),
+    "log in a missing folder": (
+        lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")],
+        "--log",
+    ),
     "log is a directory": (lambda tiny: [str(tiny), "--log", str(tiny.parent)], "--log"),
 }
 
@@ -510,7 +650,9 @@ def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tiny, t
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("argv", [["--dtype", "float16"], ["--max-iterations", "many"], ["--no-such-option", "1"]])
+@pytest.mark.parametrize(
+    "argv", [["--dtype", "float16"], ["--max-iterations", "many"], ["--no-such-option", "1"]]
+)
 def test_errors_of_the_parser_are_one_line_with_status_2_and_print_nothing_on_stdout(argv, capsys):
     status = run(argv)
     printed = capsys.readouterr()
@@ -527,7 +669,9 @@ def test_the_parser_proposes_the_nearest_option(capsys):
 def test_reject_is_for_all_observations(tmp_path, capsys):
     write_problem(support.tiny(), f"{tmp_path}/model/")
     (tmp_path / "c.yaml").write_text("part: {images: [1, 2, 3]}\n")
-    assert run([str(tmp_path / "model"), "--constraints", str(tmp_path / "c.yaml"), "--reject"]) == 2
+    assert (
+        run([str(tmp_path / "model"), "--constraints", str(tmp_path / "c.yaml"), "--reject"]) == 2
+    )
     assert capsys.readouterr().err == "error: --reject is for all observations, not for a part\n"
 
 
@@ -535,14 +679,22 @@ def test_reject_is_for_all_observations(tmp_path, capsys):
 def test_reject_notes_wrong_matches_by_image_and_leaves_them_out_of_the_model(tmp_path, capsys):
     scene = random_scene(SceneConfig(cameras=12, points=400, mean_track=6.0, trajectory="orbit"), 1)
     wrong = np.random.default_rng(0).random(scene.num_observations) < 0.2
-    pixels = np.where(wrong[:, None], np.random.default_rng(1).uniform(-300, 300, (len(wrong), 2)), scene.observations)
+    pixels = np.where(
+        wrong[:, None],
+        np.random.default_rng(1).uniform(-300, 300, (len(wrong), 2)),
+        scene.observations,
+    )
     write_problem(scene.replace(observations=pixels), f"{tmp_path}/model/")
     arguments = [str(tmp_path / "model"), "--reject", "--compilation", "quick", "--output"]
     assert run([*arguments, str(tmp_path / "out")]) == 0
-    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: rejected ")]
+    notes = [
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("note: rejected ")
+    ]
     left = read_problem(tmp_path / "out").num_observations
     assert len(notes) == 1
-    assert re.match(rf"note: rejected {len(wrong) - left} of {len(wrong)} observations: image \d+ \(", notes[0])
+    assert re.match(
+        rf"note: rejected {len(wrong) - left} of {len(wrong)} observations: image \d+ \(", notes[0]
+    )
     assert left == pytest.approx((~wrong).sum(), rel=0.03)
     assert run([*arguments, str(tmp_path / "out.txt"), "--retriangulate"]) == 2
     assert "exclude each other" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""`jaxba-train` in this process on few scenes: its files, Ctrl-C, continuing, and errors of one line."""
+"""`jaxba-train` in this process on few scenes: its files, Ctrl-C, continuing, and errors of one
+line."""
 
 from __future__ import annotations
 
@@ -22,9 +23,19 @@ from jaxba.typing import InputError
 
 TINY = [
     *("chunks=4", "evaluate_every=1", "envs=8"),
-    *("bank.kind={cameras: 4, points: 12, family: paper}", "bank.scenes=160", "bank.refine_points=0"),
+    *(
+        "bank.kind={cameras: 4, points: 12, family: paper}",
+        "bank.scenes=160",
+        "bank.refine_points=0",
+    ),
     "game.max_iterations=12",
-    *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),
+    *(
+        "sac.width=8",
+        "sac.batch=16",
+        "loop.replay_capacity=500",
+        "loop.warmup_steps=16",
+        "loop.steps_per_chunk=8",
+    ),
 ]
 COMMAND = ["--config", "default", "--set", *TINY]
 CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "evaluate_s")
@@ -92,8 +103,12 @@ def error_of(capsys, *argv: str) -> str:
 def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
     out = str(tmp_path / "run")
     assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
-    assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
-    assert "known: default, fast, paper, paper-tuned" in error_of(capsys, "--config", "best", "--out", out)
+    assert "unknown key zzz" in error_of(
+        capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out
+    )
+    assert "known: default, fast, paper, paper-tuned" in error_of(
+        capsys, "--config", "best", "--out", out
+    )
     assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
     assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
     assert not (tmp_path / "run").exists()
@@ -181,7 +196,9 @@ def test_an_interrupted_run_continues_with_the_same_results(folder, finished, ca
     assert run(["--out", str(folder), "--resume"]) == 0
     plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
     assert list(map(plain, log.read(folder))) == list(map(plain, log.read(finished)))
-    ours, theirs = (load_policy(run_folder / "policy.safetensors") for run_folder in (folder, finished))
+    ours, theirs = (
+        load_policy(run_folder / "policy.safetensors") for run_folder in (folder, finished)
+    )
     chex.assert_trees_all_equal(ours, theirs)
 
 
@@ -192,12 +209,18 @@ def test_an_interrupted_run_continues_with_the_same_results(folder, finished, ca
 def test_an_agent_is_trained_for_the_given_method(tmp_path):
     out = tmp_path / "run"
     assert run([*COMMAND, "method=stba", "chunks=1", "--out", str(out)]) == 0
-    assert list(task.build(load(str(out / "config.yaml")), out).rules) == ["stba", "ceres", "virtual best"]
+    assert list(task.build(load(str(out / "config.yaml")), out).rules) == [
+        "stba",
+        "ceres",
+        "virtual best",
+    ]
     assert (out / "policy.safetensors").is_file()
 
 
 def test_a_folder_that_has_a_run_is_refused(folder, capsys):
-    assert "holds a run already; --resume goes on with it" in error_of(capsys, *COMMAND, "--out", str(folder))
+    assert "holds a run already; --resume goes on with it" in error_of(
+        capsys, *COMMAND, "--out", str(folder)
+    )
 
 
 @pytest.mark.slow

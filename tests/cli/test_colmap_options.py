@@ -26,28 +26,48 @@ def model(tmp_path):
 
 def test_colmaps_options_are_those_of_the_command():
     words = "--input_path in --output_path=out --BundleAdjustment.refine_focal_length 0 "
-    words += "--BundleAdjustment.refine_extra_params=false --BundleAdjustment.refine_principal_point 0 "
     words += (
-        "--BundleAdjustmentCeres.max_num_iterations 7 --BundleAdjustmentCeres.loss_function_type CAUCHY --dtype mixed"
+        "--BundleAdjustment.refine_extra_params=false --BundleAdjustment.refine_principal_point 0 "
     )
-    wanted = "in --output out --max-iterations 7 --loss cauchy --dtype mixed --constant focal distortion"
+    words += "--BundleAdjustmentCeres.max_num_iterations 7 "
+    words += "--BundleAdjustmentCeres.loss_function_type CAUCHY --dtype mixed"
+    wanted = (
+        "in --output out --max-iterations 7 --loss cauchy --dtype mixed --constant focal distortion"
+    )
     assert translated(words.split()) == wanted.split()
 
 
 def test_constants_of_both_ways_are_gathered():
     words = "s --constant poses k1 --BundleAdjustment.refine_focal_length 0 --dtype mixed"
-    assert translated(words.split()) == ["s", "--dtype", "mixed", "--constant", "poses", "k1", "focal"]
+    assert translated(words.split()) == [
+        "s",
+        "--dtype",
+        "mixed",
+        "--constant",
+        "poses",
+        "k1",
+        "focal",
+    ]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("gauge: two_cameras", "gauge: must be one of free, two-cameras, three-points, not 'two_cameras'"),
+        (
+            "gauge: two_cameras",
+            "gauge: must be one of free, two-cameras, three-points, not 'two_cameras'",
+        ),
         ("gauge: [free]", "gauge: must be one of"),
         ("position_priors: {stddev: 0.1}", "position_priors: 'positions' is missing"),
         ("position_priors: {std: 0.1, positions: {}}", "position_priors: unknown key std"),
-        ("position_priors: 5", "position_priors: must be a mapping with the keys positions, stddev, loss"),
-        ("position_priors: {positions: [[1, 2, 3]]}", "position_priors: positions: must be a mapping from images"),
+        (
+            "position_priors: 5",
+            "position_priors: must be a mapping with the keys positions, stddev, loss",
+        ),
+        (
+            "position_priors: {positions: [[1, 2, 3]]}",
+            "position_priors: positions: must be a mapping from images",
+        ),
         (
             "position_priors: {positions: {9: [1, 2]}}",
             "position_priors: positions: 9: must be three numbers, not [1, 2]",
@@ -56,11 +76,17 @@ def test_constants_of_both_ways_are_gathered():
             "position_priors: {positions: {9: [1, 2, north]}}",
             "positions: 9: must be three numbers, not [1, 2, north]",
         ),
-        ("position_priors: {positions: {9: [1, 2, .nan]}}", "positions: 9: must be three numbers, not [1, 2, .nan]"),
+        (
+            "position_priors: {positions: {9: [1, 2, .nan]}}",
+            "positions: 9: must be three numbers, not [1, 2, .nan]",
+        ),
         ("position_priors: {positions: {9: [1, 2, 3]}}", "none of the images is in the problem: 9"),
         (f"{POSITIONS}, stddev: 0}}", "stddev: must be a positive number, or three, not 0"),
         (f"{POSITIONS}, stddev: 2cm}}", "stddev: must be a positive number, or three, not 2cm"),
-        (f"{POSITIONS}, stddev: [1, -1, 1]}}", "stddev: must be a positive number, or three, not [1, -1, 1]"),
+        (
+            f"{POSITIONS}, stddev: [1, -1, 1]}}",
+            "stddev: must be a positive number, or three, not [1, -1, 1]",
+        ),
         (f"{POSITIONS}, stddev: [1, 2]}}", "one or three for each of 4 images, not 2 values"),
         (
             f"{POSITIONS}, stddev: [1, 2, [0, 1, 1], 1]}}",
@@ -70,8 +96,14 @@ def test_constants_of_both_ways_are_gathered():
         (f"{POSITIONS}, loss: gauss}}", "position_priors: unknown loss 'gauss'"),
         (f"{POSITIONS}, loss_scale: wide}}", "loss_scale: must be a number, not wide"),
         (f"{POSITIONS}, align: maybe}}", "align: must be true or false, not maybe"),
-        ("constant_poses: {a: 1}", "constant_poses: must be a list (names or ids of images), not {a: 1}"),
-        ("constant_poses: [[1]]", "constant_poses: must be a list (names or ids of images), not [1]"),
+        (
+            "constant_poses: {a: 1}",
+            "constant_poses: must be a list (names or ids of images), not {a: 1}",
+        ),
+        (
+            "constant_poses: [[1]]",
+            "constant_poses: must be a list (names or ids of images), not [1]",
+        ),
         ("constant_cameras: 1.5", "constant_cameras: there is no camera '1.5'"),
         ("constant_numbers: [k1, '']", "constant_numbers: must be a list (focal, principal_point"),
         ("constant_points: [true]", "constant_points: "),
@@ -91,15 +123,33 @@ def test_mistakes_in_a_file_of_constraints_are_one_line(model, tmp_path, capsys,
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--BundleAdjustment.refine_focal_length", "--BundleAdjustment.refine_focal_length needs a value"),
+        (
+            "--BundleAdjustment.refine_focal_length",
+            "--BundleAdjustment.refine_focal_length needs a value",
+        ),
         ("--BundleAdjustment.refine_focal_length 2", "refine_focal_length must be 0 or 1, not '2'"),
-        ("--BundleAdjustment.lens 1", "--BundleAdjustment.lens is not an option here; of COLMAP's are refine_"),
-        ("--BundleAdjustment.min_track_length 3", "put part: {min_track: 3} in the file of --constraints"),
-        ("--constant k9", "--constant: no lens has a number 'k9'; there are focal, principal_point"),
+        (
+            "--BundleAdjustment.lens 1",
+            "--BundleAdjustment.lens is not an option here; of COLMAP's are refine_",
+        ),
+        (
+            "--BundleAdjustment.min_track_length 3",
+            "put part: {min_track: 3} in the file of --constraints",
+        ),
+        (
+            "--constant k9",
+            "--constant: no lens has a number 'k9'; there are focal, principal_point",
+        ),
         ("--covariance c.npz", "--covariance needs --gauge, constants or priors"),
         ("--covariance p.txt --gauge two-cameras", "--covariance p.txt: is a file of the problem"),
-        ("--covariance a.txt --output a.txt", "--output and --covariance name the same file, a.txt"),
-        ("--survey s.csv", "--survey needs control points or distances in the file of --constraints"),
+        (
+            "--covariance a.txt --output a.txt",
+            "--output and --covariance name the same file, a.txt",
+        ),
+        (
+            "--survey s.csv",
+            "--survey needs control points or distances in the file of --constraints",
+        ),
         ("--refine-principal-point", "--refine-principal-point is for COLMAP models"),
         ("--constraints none.yaml", "--constraints none.yaml: No such file"),
     ],
@@ -119,7 +169,8 @@ def test_what_cannot_be_is_one_line(words, message, tmp_path, monkeypatch, capsy
 def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_path, capsys):
     problem = read_problem(model)
     (tmp_path / "c.yaml").write_text(
-        "constant_poses: [image0001.jpg, 3]\nconstant_points: [2]\nconstant_numbers: [k2]\ngauge: free\n",
+        "constant_poses: [image0001.jpg, 3]\nconstant_points: [2]\nconstant_numbers: [k2]\ngauge: "
+        "free\n",
         encoding="utf-16",  # as older editors of Windows save text
     )
     out, spread = str(tmp_path / "out"), tmp_path / "c.npz"
@@ -150,12 +201,16 @@ def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_pat
 
 def test_a_file_of_constants_names_a_part_of_the_images(model, tmp_path):
     problem = read_problem(model)
-    (tmp_path / "c.yaml").write_text("part: {images: [image0001.jpg, 3], points: all, ignored: [2], min_track: 2}\n")
+    (tmp_path / "c.yaml").write_text(
+        "part: {images: [image0001.jpg, 3], points: all, ignored: [2], min_track: 2}\n"
+    )
     found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
     assert np.flatnonzero(~found.constants.poses.any(axis=1)).tolist() == [0, 2]
     assert 1 not in found.point_index
     (tmp_path / "c.yaml").write_text("part: {image: [1]}\n")
-    with pytest.raises(UsageError, match="part: unknown key image; there are images, points, ignored, min_track"):
+    with pytest.raises(
+        UsageError, match="part: unknown key image; there are images, points, ignored, min_track"
+    ):
         constrained(problem, (), None, str(tmp_path / "c.yaml"))
     (tmp_path / "c.yaml").write_text("part: {min_track: many}\n")
     with pytest.raises(UsageError, match="min_track: must be a whole number, not many"):
@@ -187,7 +242,9 @@ def test_names_that_look_like_numbers_are_names(text, held, model, tmp_path):
 
 def test_a_name_goes_before_an_id_and_another_form_of_a_number_is_no_id(model, tmp_path):
     problem = read_problem(model)
-    problem = problem.replace(labels=replace(problem.labels, names=("3", *problem.labels.names[1:])))
+    problem = problem.replace(
+        labels=replace(problem.labels, names=("3", *problem.labels.names[1:]))
+    )
     (tmp_path / "c.yaml").write_text('constant_poses: [3, "4"]\n')
     found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
     assert np.flatnonzero(found.constants.poses.all(axis=1)).tolist() == [0, 3]
@@ -203,9 +260,23 @@ def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
 
     problem = read_problem(model)
     goal = 3.0 * geometry.camera_centers(problem.cameras) + 7.0
-    rows = "\n".join(f"    {i}: [{', '.join(map(str, c))}]" for i, c in zip(problem.labels.images, goal, strict=True))
+    rows = "\n".join(
+        f"    {i}: [{', '.join(map(str, c))}]"
+        for i, c in zip(problem.labels.images, goal, strict=True)
+    )
     (tmp_path / "c.yaml").write_text(f"position_priors:\n  stddev: 0.01\n  positions:\n{rows}\n")
-    assert run([str(model), "--constraints", str(tmp_path / "c.yaml"), "--output", str(tmp_path / "out")]) == 0
+    assert (
+        run(
+            [
+                str(model),
+                "--constraints",
+                str(tmp_path / "c.yaml"),
+                "--output",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 0
+    )
     centers = geometry.camera_centers(read_problem(tmp_path / "out").cameras)
     np.testing.assert_allclose(centers, goal, atol=0.3)
     (tmp_path / "c.yaml").write_text("constant_images: [1]\n")
@@ -225,9 +296,13 @@ def test_positions_of_other_images_are_left_out_with_a_note(model, tmp_path):
     accuracy = ["0.01", 1e3] * 5 + [1]
     text = "".join(f"    {name}: {row}\n" for name, row in rows.items())
     file.write_text(
-        f"position_priors:\n  align: false\n  stddev: [{', '.join(map(str, accuracy))}]\n  positions:\n{text}"
+        f"position_priors:\n  align: false\n  stddev: [{', '.join(map(str, accuracy))}]\n  "
+        f"positions:\n{text}"
     )
-    left = "positions of 6 images that the problem does not have: later0.jpg, later1.jpg, later2.jpg and 3 more"
+    left = (
+        "positions of 6 images that the problem does not have: later0.jpg, later1.jpg, "
+        "later2.jpg and 3 more"
+    )
     with pytest.warns(ProblemWarning, match=f"log.yaml: position_priors: left out {left}"):
         found = constrained(problem, (), None, str(file))
     (rows,) = found.residuals.rows
@@ -242,11 +317,16 @@ def test_notes_of_a_solve_know_what_is_constant(unchecked):
     from jaxba.cli import table
 
     def remarks(problem: BundleProblem) -> str:
-        return "".join(table.remarks(problem, SimpleNamespace(problem=problem, set_aside=np.zeros(0, int))))
+        return "".join(
+            table.remarks(problem, SimpleNamespace(problem=problem, set_aside=np.zeros(0, int)))
+        )
 
     problem = support.odd()
     free = remarks(problem)
-    assert all(words in free for words in ("seen once", "positions stay as they are", "poses stay as they are"))
+    assert all(
+        words in free
+        for words in ("seen once", "positions stay as they are", "poses stay as they are")
+    )
     for part, words in (("points", ("seen once", "positions stay")), ("poses", ("poses stay",))):
         text = remarks(hold(problem, **{part: "all"}))
         assert not any(word in text for word in words), text
@@ -254,7 +334,9 @@ def test_notes_of_a_solve_know_what_is_constant(unchecked):
 
 def test_options_say_the_same_as_the_functions_of_python(model):
     problem = read_problem(model)
-    wanted: BundleProblem = with_gauge(hold(problem, rotations="all", numbers=["focal"]), "two-cameras")
+    wanted: BundleProblem = with_gauge(
+        hold(problem, rotations="all", numbers=["focal"]), "two-cameras"
+    )
     found = constrained(problem, ("rotations", "focal"), "two-cameras", None)
     assert (found.constants.poses == wanted.constants.poses).all()
     assert (found.lenses.free == wanted.lenses.free).all()

@@ -49,7 +49,10 @@ def test_a_text_is_reflowed(capsys, monkeypatch):
     ("arguments", "names"),
     [
         (["--policy", "learned", "--scaling", "identity"], ["--scaling"]),
-        (["--constant", "fokal"], ["--constant", "'fokal'", "focal", "k1", "poses", "points", "extrinsics"]),
+        (
+            ["--constant", "fokal"],
+            ["--constant", "'fokal'", "focal", "k1", "poses", "points", "extrinsics"],
+        ),
     ],
 )
 def test_an_error_names_the_option_and_what_it_may_be(arguments, names, capsys):

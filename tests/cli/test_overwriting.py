@@ -1,4 +1,5 @@
-"""No output of a command may be a file that it reads, or another of its outputs, whatever the file is called."""
+"""No output of a command may be a file that it reads, or another of its outputs, whatever the file
+is called."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ from jaxba.cli import bench, kitti, paper, solve, train, view
 from jaxba.cli.common import UsageError
 from jaxba.cli.overwriting import check_apart
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="other systems have other links and devices")
+linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems have other links and devices"
+)
 
 
 @pytest.fixture
@@ -51,22 +54,47 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 CASES = [
-    (solve, "model --output model/images.txt", "--output model/images.txt: is a file of the problem"),
+    (
+        solve,
+        "model --output model/images.txt",
+        "--output model/images.txt: is a file of the problem",
+    ),
     (solve, "model --output link/frames.txt", "--output link/frames.txt: is a file of the problem"),
     (solve, "model --output hard.txt", "--output hard.txt: is a file of the problem"),
     (solve, "link --log model/points3D.bin", "--log model/points3D.bin: is a file of the problem"),
-    (solve, "model --log model/rigs.txt", "--log model/rigs.txt: is a file of the problem"),  # would belong to it
+    # would belong to it
+    (solve, "model --log model/rigs.txt", "--log model/rigs.txt: is a file of the problem"),
     (solve, "p.txt --log ./model/../p.txt", "is a file of the problem"),
-    (solve, "model --constraints g.yaml --log g.yaml", "--log g.yaml: is the file of --constraints"),
+    (
+        solve,
+        "model --constraints g.yaml --log g.yaml",
+        "--log g.yaml: is the file of --constraints",
+    ),
     (solve, "p.txt --constraints g.yaml --output g.yaml", "g.yaml"),
     (solve, "p.txt --output new.txt --log ./new.txt", "--output and --log name the same file"),
-    (solve, "p.txt --record new.npz --covariance model/../new.npz --gauge two-cameras", "name the same file"),
+    (
+        solve,
+        "p.txt --record new.npz --covariance model/../new.npz --gauge two-cameras",
+        "name the same file",
+    ),
     (solve, "model --output new/ --log new/points3D.bin", "folder new does not exist"),
-    (solve, "model --output photos --log photos/points3D.bin", "--output and --log name the same file"),
+    (
+        solve,
+        "model --output photos --log photos/points3D.bin",
+        "--output and --log name the same file",
+    ),
     (view, "model --html model/cameras.bin", "--html model/cameras.bin: is a file of the problem"),
     (view, "p.txt --html p.frames.json", "is a file of the problem"),
-    (view, "model --images kitti/image_0 --html kitti/image_0/000001.png", "000001.png: is an image"),
-    (kitti, "kitti --poses kitti/poses.txt --out kitti/poses.txt", "--out kitti/poses.txt: is the file of --poses"),
+    (
+        view,
+        "model --images kitti/image_0 --html kitti/image_0/000001.png",
+        "000001.png: is an image",
+    ),
+    (
+        kitti,
+        "kitti --poses kitti/poses.txt --out kitti/poses.txt",
+        "--out kitti/poses.txt: is the file of --poses",
+    ),
     (kitti, "kitti --out kitti/calib.txt", "kitti/calib.txt: is a file of the sequence"),
     (kitti, "kitti --out kitti/times.txt", "kitti/times.txt: is a file of the sequence"),
     (bench, "scene:street --suite run/settings.json --out run", "is the file of --suite"),
@@ -76,7 +104,9 @@ CASES = [
 
 
 @linux
-@pytest.mark.parametrize(("command", "words", "message"), CASES, ids=[words for _, words, _ in CASES])
+@pytest.mark.parametrize(
+    ("command", "words", "message"), CASES, ids=[words for _, words, _ in CASES]
+)
 def test_nothing_is_computed_and_no_file_changes(command, words, message, place, capsys):
     before = contents(place)
     assert command.run(words.split()) == 2
@@ -89,14 +119,23 @@ def test_nothing_is_computed_and_no_file_changes(command, words, message, place,
 @linux
 def test_other_files_devices_and_streams_may_be_written(place):
     free = ["new.txt", "missing/new.txt", "/dev/null", "/dev/stdout"]
-    check_apart({"--output": free, "--log": ["other.txt", None], "--record": ["/dev/null"]}, {"an input": ["p.txt"]})
+    check_apart(
+        {"--output": free, "--log": ["other.txt", None], "--record": ["/dev/null"]},
+        {"an input": ["p.txt"]},
+    )
     with pytest.raises(UsageError, match="--output and --log name the same file, /dev/fd/1"):
         check_apart({"--output": ["/dev/stdout"], "--log": ["/dev/fd/1"]}, {})
 
 
 @linux
 def test_a_stream_that_a_shell_sends_to_an_input_is_that_input(place):
-    code = "from jaxba.cli.overwriting import check_apart; check_apart({'--log': ['/dev/stdout']}, {'it': ['p.txt']})"
+    code = (
+        "from jaxba.cli.overwriting import check_apart; check_apart({'--log': "
+        "['/dev/stdout']}, "
+        "{'it': ['p.txt']})"
+    )
     with open("p.txt", "a") as redirected:
-        ran = subprocess.run([sys.executable, "-c", code], stdout=redirected, stderr=subprocess.PIPE, text=True)
+        ran = subprocess.run(
+            [sys.executable, "-c", code], stdout=redirected, stderr=subprocess.PIPE, text=True
+        )
     assert "--log /dev/stdout: is it" in ran.stderr

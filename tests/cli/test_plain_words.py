@@ -14,7 +14,10 @@ from jaxba.cli import bench, solve
         (["--loss-scale", "1,5"], "--loss-scale must be a number, not '1,5'"),
         (["--max-iterations", "2.5"], "--max-iterations must be a whole number, not '2.5'"),
         (["--devices", "two"], "--devices must be a whole number, not 'two'"),
-        (["--loss", "l1"], "--loss must be one of cauchy, huber, soft_l1, squared, tukey, not 'l1'"),
+        (
+            ["--loss", "l1"],
+            "--loss must be one of cauchy, huber, soft_l1, squared, tukey, not 'l1'",
+        ),
         (["--gauge", "four"], "--gauge must be one of free, three-points, two-cameras, not 'four'"),
         (["--ftol"], "--ftol needs a value"),
     ],

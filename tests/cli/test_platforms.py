@@ -25,13 +25,27 @@ def test_a_platform_that_is_not_there_ends_a_command_with_one_line(tmp_path, pla
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("options", "files"), [(["--devices", "1"], "*-cache"), ([], "*.jaxba-program")])
-def test_a_torn_program_of_the_cache_is_compiled_again_without_a_word_and_replaced(options, files, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "files"), [(["--devices", "1"], "*-cache"), ([], "*.jaxba-program")]
+)
+def test_a_torn_program_of_the_cache_is_compiled_again_without_a_word_and_replaced(
+    options, files, tmp_path
+):
     """In JAX's cache, and in that of programs that are found without tracing."""
     jaxba.write_bal(jaxba.random_scene(jaxba.scene_like("paper"), 0), tmp_path / "problem.txt")
-    command = [sys.executable, "-c", SOLVE, str(tmp_path / "problem.txt"), "--max-iterations", "2", *options]
+    command = [
+        sys.executable,
+        "-c",
+        SOLVE,
+        str(tmp_path / "problem.txt"),
+        "--max-iterations",
+        "2",
+        *options,
+    ]
     env = {**os.environ, "JAXBA_CACHE": str(tmp_path / "programs"), "JAX_COMPILATION_CACHE_DIR": ""}
-    run = lambda: subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True)
+    run = lambda: subprocess.run(
+        command, env=env, capture_output=True, text=True, timeout=120, check=True
+    )
     whole = run().stdout.splitlines()[-3:]
     largest = max((tmp_path / "programs").rglob(files), key=lambda path: path.stat().st_size)
     os.truncate(largest, 1000)

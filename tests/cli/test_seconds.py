@@ -37,7 +37,9 @@ def test_the_best_state_so_far_is_written(tiny, tmp_path, capsys):
     assert geometry.cost(jaxba.read_bal(output)) < geometry.cost(support.tiny())
 
 
-def test_a_limit_below_the_set_up_writes_the_start_with_a_note_and_is_no_failure(tiny, tmp_path, capsys):
+def test_a_limit_below_the_set_up_writes_the_start_with_a_note_and_is_no_failure(
+    tiny, tmp_path, capsys
+):
     output = tmp_path / "out.txt"
     assert run([str(tiny), *ASKED, "--seconds", "0.5", "--strict", "--output", str(output)]) == 0
     shown = capsys.readouterr()
@@ -55,7 +57,22 @@ def test_several_problems_and_recipes_have_it(tiny, tmp_path, capsys):
     with (folder / COSTS).open(newline="") as file:
         assert [row["end"] for row in csv.DictReader(file)] == ["time limit"] * 2
     capsys.readouterr()
-    assert run([str(tiny), "--compilation", "quick", "--ftol", "0", "--seconds", "8.5", "--recipes", "2"]) == 0
+    assert (
+        run(
+            [
+                str(tiny),
+                "--compilation",
+                "quick",
+                "--ftol",
+                "0",
+                "--seconds",
+                "8.5",
+                "--recipes",
+                "2",
+            ]
+        )
+        == 0
+    )
     assert "not converged: time limit" in capsys.readouterr().out
 
 

@@ -1,4 +1,5 @@
-"""`jaxba-solve` with several problems: a solution and a line for each, whatever becomes of the others."""
+"""`jaxba-solve` with several problems: a solution and a line for each, whatever becomes of the
+others."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def problems(tmp_path):
     folder = tmp_path / "given"
     folder.mkdir()
     for seed in range(3):
-        jaxba.write_problem(jaxba.random_scene(jaxba.scene_like("tiny"), seed), folder / f"scene-{seed}.txt.gz")
+        jaxba.write_problem(
+            jaxba.random_scene(jaxba.scene_like("tiny"), seed), folder / f"scene-{seed}.txt.gz"
+        )
     return folder
 
 
@@ -62,7 +65,9 @@ def test_one_that_fails_is_one_line_and_the_others_go_on(problems, tmp_path, cap
     assert not (output / "bad\n.txt").exists()
 
 
-def test_what_is_only_read_is_written_as_a_bal_file_and_a_folder_of_opensfm_is_one_problem(problems, tmp_path):
+def test_what_is_only_read_is_written_as_a_bal_file_and_a_folder_of_opensfm_is_one_problem(
+    problems, tmp_path
+):
     paths = ["a/x.sfm", "a/y.json", "a/z.txt.gz"]
     assert several._names(paths) == ["x.sfm.txt", "y.json.txt", "z.txt.gz"]
     (tmp_path / "sfm").mkdir()
@@ -122,7 +127,15 @@ def test_a_run_does_not_go_on_by_constraints_whose_files_have_changed(problems, 
     constraints.write_text("constant_points: [3]\nposition_priors: {file: log.csv, stddev: 5}\n")
     positions = [f"{number},{number % 3},{number},0.{number}" for number in range(6)]
     log.write_text("\n".join(["image,x,y,z", *positions]) + "\n")
-    asked = [str(problems), "--output", str(output), "--constraints", str(constraints), "--max-iterations", "0"]
+    asked = [
+        str(problems),
+        "--output",
+        str(output),
+        "--constraints",
+        str(constraints),
+        "--max-iterations",
+        "0",
+    ]
     assert run(asked) == 0
     assert run([*asked, "--resume", "--compilation", "auto"]) == 0
     assert "3 of 3 are there already" in capsys.readouterr().out
@@ -154,7 +167,9 @@ def test_what_has_changed_and_what_is_lost_is_solved_anew(problems, tmp_path, ca
     assert (output / "scene-1.txt.gz").exists()
 
 
-def test_an_error_that_nobody_expects_comes_after_the_solutions_of_what_was_read(problems, tmp_path, monkeypatch):
+def test_an_error_that_nobody_expects_comes_after_the_solutions_of_what_was_read(
+    problems, tmp_path, monkeypatch
+):
     def read(args, path):
         if path.endswith("scene-2.txt.gz"):
             raise RuntimeError("unexpected")
@@ -177,7 +192,14 @@ def test_a_run_goes_on_with_names_of_any_bytes_and_costs_that_an_editor_or_a_cra
     whole = costs.read_bytes()
     costs.write_bytes(whole + b"\n\0\0\xff\n")
     capsys.readouterr()
-    again = [str(odd), str(problems / "scene-1.txt.gz"), "--output", str(output), "--resume", *ASKED]
+    again = [
+        str(odd),
+        str(problems / "scene-1.txt.gz"),
+        "--output",
+        str(output),
+        "--resume",
+        *ASKED,
+    ]
     assert run(again) == 0
     printed = capsys.readouterr()
     assert "2 of 2 are there already" in printed.out

@@ -32,7 +32,8 @@ def on_earth(places: np.ndarray) -> np.ndarray:
     """Latitude, longitude and height of metres east, north and up."""
     lon, lat, height = ORIGIN
     pipeline = (
-        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={lon} +lat_0={lat} +h_0={height} "
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={lon} +lat_0={lat} "
+        f"+h_0={height} "
         "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
     lon, lat, height = pyproj.Transformer.from_pipeline(pipeline).transform(*places.T)
@@ -46,7 +47,8 @@ def _solved() -> jaxba.BundleProblem:
 
 @pytest.fixture
 def scene(tmp_path) -> tuple[Path, jaxba.BundleProblem, np.ndarray]:
-    """A solved model of six images, and where the images are on the earth: another frame of ten times its size."""
+    """A solved model of six images, and where the images are on the earth: another frame of ten
+    times its size."""
     jaxba.write_colmap(_solved(), folder := tmp_path / "model")
     problem = jaxba.read_colmap(folder)
     turn = geometry.rotation_matrices(np.array([[0.3, -0.2, 1.0]]))[0]
@@ -59,7 +61,10 @@ def distances(places: np.ndarray) -> np.ndarray:
 
 def write_log(path: Path, problem: jaxba.BundleProblem, places: np.ndarray) -> None:
     rows = zip((*problem.labels.names, "other.jpg"), [*places.tolist(), [0, 0, 0]], strict=True)
-    path.write_text("image,lat,lon,alt,accuracy\n" + "".join(f"{n},{a!r},{b!r},{c!r},0.05\n" for n, (a, b, c) in rows))
+    path.write_text(
+        "image,lat,lon,alt,accuracy\n"
+        + "".join(f"{n},{a!r},{b!r},{c!r},0.05\n" for n, (a, b, c) in rows)
+    )
 
 
 def write_database(path: Path, problem: jaxba.BundleProblem, places: np.ndarray) -> None:
@@ -101,13 +106,25 @@ def test_positions_on_the_earth_make_a_scene_in_metres(source, scene, tmp_path):
     with pytest.warns(ProblemWarning) as notes:
         found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
     said = "\n".join(str(one.message) for one in notes)
-    assert ("left out positions of 1 image that the problem does not have: other.jpg" in said) == (source == "file")
-    assert f"the scene is in {'EPSG:32632' if crs else 'metres east, north and up of latitude 47.'}" in said
+    assert ("left out positions of 1 image that the problem does not have: other.jpg" in said) == (
+        source == "file"
+    )
+    assert (
+        f"the scene is in {'EPSG:32632' if crs else 'metres east, north and up of latitude 47.'}"
+        in said
+    )
     (rows,) = found.residuals.rows
-    np.testing.assert_allclose(np.asarray(rows.data[1]), np.tile(np.eye(3) / 0.05, (6, 1, 1)), atol=1e-9)
-    centers, before = geometry.camera_centers(found.cameras), geometry.camera_centers(problem.cameras)
     np.testing.assert_allclose(
-        distances(centers), 10 * distances(before), rtol={"projected": 1e-3, "photos": 1e-4}.get(source, 1e-9)
+        np.asarray(rows.data[1]), np.tile(np.eye(3) / 0.05, (6, 1, 1)), atol=1e-9
+    )
+    centers, before = (
+        geometry.camera_centers(found.cameras),
+        geometry.camera_centers(problem.cameras),
+    )
+    np.testing.assert_allclose(
+        distances(centers),
+        10 * distances(before),
+        rtol={"projected": 1e-3, "photos": 1e-4}.get(source, 1e-9),
     )
     if crs:
         expected = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*places.T[:2])
@@ -116,11 +133,15 @@ def test_positions_on_the_earth_make_a_scene_in_metres(source, scene, tmp_path):
 
 def test_positions_of_nerfstudio_give_the_scene_their_scale(scene, tmp_path):
     _, problem, _ = scene
-    jaxba.write_transforms(transformed(problem, Similarity(3.0, np.eye(3), np.ones(3))), tmp_path / "transforms.json")
+    jaxba.write_transforms(
+        transformed(problem, Similarity(3.0, np.eye(3), np.ones(3))), tmp_path / "transforms.json"
+    )
     (tmp_path / "c.yaml").write_text("position_priors: {file: transforms.json, stddev: 0.05}\n")
     found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
     np.testing.assert_allclose(
-        geometry.camera_centers(found.cameras), 3 * geometry.camera_centers(problem.cameras) + 1, atol=1e-9
+        geometry.camera_centers(found.cameras),
+        3 * geometry.camera_centers(problem.cameras) + 1,
+        atol=1e-9,
     )
 
 
@@ -129,7 +150,12 @@ def test_images_are_found_by_the_names_of_their_files(scene, tmp_path):
     labels = problem.labels
     write_log(tmp_path / "log.csv", problem, places)
     problem = problem.replace(
-        labels=Labels(tuple(f"flight/{name}" for name in labels.names), labels.images, labels.lenses, labels.points)
+        labels=Labels(
+            tuple(f"flight/{name}" for name in labels.names),
+            labels.images,
+            labels.lenses,
+            labels.points,
+        )
     )
     (tmp_path / "c.yaml").write_text("position_priors: {file: log.csv}\n")
     with pytest.warns(ProblemWarning):
@@ -180,7 +206,10 @@ def test_names_that_are_not_there_or_not_clear_are_noted_beside_one_that_is(scen
     assert notes[0].endswith(
         "left out positions of 1 image that the problem does not have: gone.jpg; it has a/IMG_1.jpg"
     )
-    assert "positions of 1 image whose names are not clear: IMG_1.jpg; a/IMG_1.jpg and b/IMG_1.jpg may both" in notes[1]
+    assert (
+        "positions of 1 image whose names are not clear: IMG_1.jpg; a/IMG_1.jpg and b/IMG_1.jpg "
+        "may both" in notes[1]
+    )
 
 
 @pytest.mark.parametrize("source", ["file", "database", "photos", "positions"])
@@ -194,11 +223,20 @@ def test_images_without_a_fix_are_left_out_and_do_not_move_the_frame(source, sce
     write_database(tmp_path / "d.db", problem, places)
     write_photos(tmp_path / "images", problem, places)
     inline = {name: place for name, place in zip(names, places.tolist(), strict=True)}
-    value = {"file": tmp_path / "log.csv", "database": tmp_path / "d.db", "photos": tmp_path / "images"}
-    given = {source: value.get(source, inline), "stddev": 0.5} | ({} if source in value else {"crs": "EPSG:4326"})
+    value = {
+        "file": tmp_path / "log.csv",
+        "database": tmp_path / "d.db",
+        "photos": tmp_path / "images",
+    }
+    given = {source: value.get(source, inline), "stddev": 0.5} | (
+        {} if source in value else {"crs": "EPSG:4326"}
+    )
     found, notes = surveyed(problem, position_priors=given)
     assert found.residuals.rows[0].index[0].tolist() == [0, 2, 3, 5]
-    assert any(f"left out positions of 2 images without a fix: {names[1]}, {names[4]}" in note for note in notes)
+    assert any(
+        f"left out positions of 2 images without a fix: {names[1]}, {names[4]}" in note
+        for note in notes
+    )
     assert np.abs(np.asarray(found.residuals.rows[0].data[0])).max() < 1000
     with pytest.raises(ProblemError, match=r"position_priors: .*positions of .* image"):
         jaxba.survey(problem, {"position_priors": given}, strict=True)
@@ -206,10 +244,17 @@ def test_images_without_a_fix_are_left_out_and_do_not_move_the_frame(source, sce
 
 def test_accuracies_of_a_table_that_are_not_all_there_count(scene, tmp_path):
     _, problem, places = scene
-    rows = [f"{name},{a!r},{b!r},{c!r}" for name, (a, b, c) in zip(problem.labels.names, places.tolist(), strict=True)]
-    (tmp_path / "log.csv").write_text("\n".join(["image,lat,lon,alt,hacc", *(f"{row},0.02" for row in rows)]))
+    rows = [
+        f"{name},{a!r},{b!r},{c!r}"
+        for name, (a, b, c) in zip(problem.labels.names, places.tolist(), strict=True)
+    ]
+    (tmp_path / "log.csv").write_text(
+        "\n".join(["image,lat,lon,alt,hacc", *(f"{row},0.02" for row in rows)])
+    )
     found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv"})
-    assert any("no accuracy of heights: they get 2 times the horizontal one" in note for note in notes)
+    assert any(
+        "no accuracy of heights: they get 2 times the horizontal one" in note for note in notes
+    )
     np.testing.assert_allclose(deviations(found), np.tile([0.02, 0.02, 0.04], (6, 1)))
     found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv", "stddev": 0.5})
     assert not any("accuracy" in note for note in notes)
@@ -219,14 +264,20 @@ def test_accuracies_of_a_table_that_are_not_all_there_count(scene, tmp_path):
     base = tmp_path / "d.db"
     write_database(base, problem, places)
     with sqlite3.connect(base) as connection:
-        for image, covariance in ((2, np.full((3, 3), np.nan)), (3, np.eye(3)), (4, np.zeros((3, 3)))):
+        for image, covariance in (
+            (2, np.full((3, 3), np.nan)),
+            (3, np.eye(3)),
+            (4, np.zeros((3, 3))),
+        ):
             connection.execute(
-                "UPDATE pose_priors SET position_covariance = ? WHERE corr_data_id = ?", (covariance.tobytes(), image)
+                "UPDATE pose_priors SET position_covariance = ? WHERE corr_data_id = ?",
+                (covariance.tobytes(), image),
             )
     connection.close()
     found, notes = surveyed(problem, position_priors={"database": base})
     assert any(
-        f"no accuracy of 2 images, which get the largest of the others: {problem.labels.names[2]}" in note
+        f"no accuracy of 2 images, which get the largest of the others: {problem.labels.names[2]}"
+        in note
         for note in notes
     )
     np.testing.assert_allclose(deviations(found)[:, 0], [0.05, 0.05, 1, 1, 1, 0.05])
@@ -234,18 +285,24 @@ def test_accuracies_of_a_table_that_are_not_all_there_count(scene, tmp_path):
 
 def test_an_image_with_two_positions_has_none(scene, tmp_path):
     _, problem, places = scene
-    rows = [f"{name},{a!r},{b!r},{c!r}" for name, (a, b, c) in zip(problem.labels.names, places.tolist(), strict=True)]
+    rows = [
+        f"{name},{a!r},{b!r},{c!r}"
+        for name, (a, b, c) in zip(problem.labels.names, places.tolist(), strict=True)
+    ]
     other = f"{rows[1].rpartition(',')[0]},{float(places[1, 2]) + 0.5!r}"
     (tmp_path / "log.csv").write_text("\n".join(["image,lat,lon,alt", *rows, rows[0], other]))
     found, notes = surveyed(problem, position_priors={"file": tmp_path / "log.csv"})
     assert found.residuals.rows[0].index[0].tolist() == [0, 2, 3, 4, 5]
     name = problem.labels.names[1]
     assert any(
-        note.endswith(f"positions of 1 image with other ones in another row, in 2 rows: {name}") for note in notes
+        note.endswith(f"positions of 1 image with other ones in another row, in 2 rows: {name}")
+        for note in notes
     )
 
 
-def test_a_coordinate_system_of_the_scene_counts_for_positions_without_one_or_is_noted(scene, tmp_path):
+def test_a_coordinate_system_of_the_scene_counts_for_positions_without_one_or_is_noted(
+    scene, tmp_path
+):
     _, problem, places = scene
     east, north = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(*places.T[:2])
     rows = [
@@ -253,12 +310,15 @@ def test_a_coordinate_system_of_the_scene_counts_for_positions_without_one_or_is
         for name, x, y, z in zip(problem.labels.names, east, north, places[:, 2], strict=True)
     ]
     (tmp_path / "log.csv").write_text("\n".join(["Label;X/Easting;Y/Northing;Z/Altitude", *rows]))
-    found, notes = surveyed(problem, crs="EPSG:32632", position_priors={"file": tmp_path / "log.csv"})
+    found, notes = surveyed(
+        problem, crs="EPSG:32632", position_priors={"file": tmp_path / "log.csv"}
+    )
     assert any("positions are taken as of EPSG:32632" in note for note in notes)
     np.testing.assert_allclose(found.residuals.rows[0].data[0][:, 0], east, atol=1e-3)
     _, notes = surveyed(problem, crs="EPSG:32632", constant_poses=[problem.labels.names[0]])
     assert notes == [
-        "constraints: crs: nothing moves the scene there: it needs position_priors or a file of control_points"
+        "constraints: crs: nothing moves the scene there: it needs position_priors or a file of "
+        "control_points"
     ]
 
 
@@ -267,32 +327,57 @@ def test_the_written_model_stays_in_metres(scene, tmp_path, capsys):
     folder, problem, places = scene
     write_log(tmp_path / "log.csv", problem, places)
     (tmp_path / "c.yaml").write_text("position_priors: {file: log.csv}\n")
-    assert run([str(folder), "--constraints", str(tmp_path / "c.yaml"), "--output", str(tmp_path / "out")]) == 0
-    assert "c.yaml: position_priors: the scene is in metres east, north and up of" in capsys.readouterr().out
+    assert (
+        run(
+            [
+                str(folder),
+                "--constraints",
+                str(tmp_path / "c.yaml"),
+                "--output",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 0
+    )
+    assert (
+        "c.yaml: position_priors: the scene is in metres east, north and up of"
+        in capsys.readouterr().out
+    )
     centers = geometry.camera_centers(jaxba.read_colmap(tmp_path / "out").cameras)
-    np.testing.assert_allclose(distances(centers), distances(10 * geometry.camera_centers(problem.cameras)), atol=0.1)
+    np.testing.assert_allclose(
+        distances(centers), distances(10 * geometry.camera_centers(problem.cameras)), atol=0.1
+    )
 
 
 @pytest.mark.slow
-def test_a_position_that_does_not_fit_is_named_and_strict_ends_with_a_status(scene, tmp_path, capsys):
+def test_a_position_that_does_not_fit_is_named_and_strict_ends_with_a_status(
+    scene, tmp_path, capsys
+):
     """The solution is written, and the log has the note."""
     folder, problem, places = scene
     wrong = np.array(places)
     wrong[2, 2] += 10.0  # metres up, 200 standard deviations
     write_log(tmp_path / "log.csv", problem, wrong)
     log = (tmp_path / "log.csv").read_text().splitlines()
-    (tmp_path / "log.csv").write_text("\n".join([*log[:-1], ""]))  # strict refuses the image that is not there
+    # strict refuses the image that is not there
+    (tmp_path / "log.csv").write_text("\n".join([*log[:-1], ""]))
     (tmp_path / "c.yaml").write_text("position_priors: {file: log.csv}\n")
     files = {"--constraints": "c.yaml", "--output": "out", "--log": "log.json"}
     options = [word for option, name in files.items() for word in (option, str(tmp_path / name))]
     assert run([str(folder), *options, "--strict", "--policy", "ceres"]) == MISFIT
     shown = capsys.readouterr()
     (note,) = [
-        line for line in shown.out.splitlines() if line.startswith("note: position_prior: does not fit the rest")
+        line
+        for line in shown.out.splitlines()
+        if line.startswith("note: position_prior: does not fit the rest")
     ]
     assert problem.labels.names[2] in note
-    assert not [name for name in problem.labels.names if name in note and name != problem.labels.names[2]]
-    assert shown.err.endswith("error: --strict: what was measured does not fit, see the notes above\n")
+    assert not [
+        name for name in problem.labels.names if name in note and name != problem.labels.names[2]
+    ]
+    assert shown.err.endswith(
+        "error: --strict: what was measured does not fit, see the notes above\n"
+    )
     assert len(jaxba.read_colmap(tmp_path / "out").cameras) == 6
     assert json.loads((tmp_path / "log.json").read_text())["notes"] == [note.removeprefix("note: ")]
 
@@ -304,11 +389,20 @@ def test_a_position_that_does_not_fit_is_named_and_strict_ends_with_a_status(sce
         ("position_priors: {file: gone.csv}", "position_priors: cannot read"),
         ("position_priors: {file: [1]}", "position_priors: file: must be a name, not"),
         ("position_priors: {file: bad.csv}", "bad.csv line 2: 'north' is not a number (latitude)"),
-        ("position_priors: {file: log.csv, crs: EPSG:32632}", "crs: latitudes and longitudes are not of EPSG:32632"),
+        (
+            "position_priors: {file: log.csv, crs: EPSG:32632}",
+            "crs: latitudes and longitudes are not of EPSG:32632",
+        ),
         ("position_priors: {file: log.csv, crs: [1]}", "crs: must be a name, not"),
-        ("position_priors: {database: log.csv}", "log.csv: is no database of COLMAP with positions"),
+        (
+            "position_priors: {database: log.csv}",
+            "log.csv: is no database of COLMAP with positions",
+        ),
         ("position_priors: {photos: .}", "no photo of the model there has a GPS position"),
-        ("position_priors: {file: log.csv, database: d.db}", "position_priors: unknown key database; there are file"),
+        (
+            "position_priors: {file: log.csv, database: d.db}",
+            "position_priors: unknown key database; there are file",
+        ),
     ],
 )
 def test_mistakes_are_one_line_that_names_the_key(text, message, scene, tmp_path):
@@ -324,9 +418,15 @@ def test_mistakes_are_one_line_that_names_the_key(text, message, scene, tmp_path
 @pytest.mark.extra
 @pytest.mark.parametrize("down", [(0.0, 1.0, 0.0), (0.6, 0.0, -0.8)])
 def test_gravity_of_colmaps_database_is_down_in_the_images(down, tmp_path):
-    """COLMAP makes rigs of two cameras, with and without gravity; its own poses have no residual."""
+    """COLMAP makes rigs of two cameras, with and without gravity; its own poses have no
+    residual."""
     pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
-    options = {"num_rigs": 1, "num_cameras_per_rig": 2, "prior_gravity": True, "prior_gravity_in_world": down}
+    options = {
+        "num_rigs": 1,
+        "num_cameras_per_rig": 2,
+        "prior_gravity": True,
+        "prior_gravity_in_world": down,
+    }
     with pycolmap.Database.open(tmp_path / "d.db") as base:
         made = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(**options), base)
         (first, *_) = base.read_all_pose_priors()
@@ -339,7 +439,9 @@ def test_gravity_of_colmaps_database_is_down_in_the_images(down, tmp_path):
     (rows,) = found.residuals.rows
     assert len(rows) == problem.num_cameras - 1
     assert costs_by_kind(found)["gravity"] < 1e-20
-    assert costs_by_kind(surveyed(down))["gravity"] == pytest.approx(len(rows) * 0.5 * (2 / 0.02) ** 2)
+    assert costs_by_kind(surveyed(down))["gravity"] == pytest.approx(
+        len(rows) * 0.5 * (2 / 0.02) ** 2
+    )
     with pytest.raises(ProblemError, match=r"gravity: .*no\.db: is no database of COLMAP"):
         jaxba.survey(problem, {"gravity": {"up": down, "database": tmp_path / "no.db"}})
     write_database(tmp_path / "old.db", problem, np.zeros((problem.num_cameras, 3)))

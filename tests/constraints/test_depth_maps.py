@@ -1,4 +1,5 @@
-"""Depth maps of any size of the shape of their images are read; what is not of them, or no depth, is refused."""
+"""Depth maps of any size of the shape of their images are read; what is not of them, or no depth,
+is refused."""
 
 from __future__ import annotations
 

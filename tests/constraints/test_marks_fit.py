@@ -1,4 +1,5 @@
-"""What marks cannot be is said before anything is solved: of other photos, apart, upside down, at other heights."""
+"""What marks cannot be is said before anything is solved: of other photos, apart, upside down, at
+other heights."""
 
 from __future__ import annotations
 
@@ -65,12 +66,15 @@ def test_marks_that_fit_get_no_note(said, facade):
 def test_marks_of_resized_photos_are_refused_with_both_sizes(said, facade, size):
     width, height = (round(size * side) for side in facade.size)
     with pytest.raises(
-        ProblemError, match=rf"control_points: the pixels .* {size:.3g} times .* {width} x {height} inst"
+        ProblemError,
+        match=rf"control_points: the pixels .* {size:.3g} times .* {width} x {height} inst",
     ):
         said(facade, lambda survey: scaled(survey, size))
 
 
-@pytest.mark.parametrize(("change", "what"), [(upside_down, "upside down"), (y_up, "whose y goes up")])
+@pytest.mark.parametrize(
+    ("change", "what"), [(upside_down, "upside down"), (y_up, "whose y goes up")]
+)
 def test_marks_of_turned_photos_are_refused(said, facade, change, what):
     with pytest.raises(ProblemError, match=f"those of photos {what}"):
         said(facade, change)
@@ -91,7 +95,10 @@ def test_pixels_outside_of_their_image_are_left_out(said, facade):
 
     image = facade.names[facade.mark_seen[2, 0]]
     (note,) = said(facade, change)
-    assert f"pixels of gcp3 lie outside of {image} (6000 x 4000): photos of another size, or turned?" in note
+    assert (
+        f"pixels of gcp3 lie outside of {image} (6000 x 4000): photos of another size, or turned?"
+        in note
+    )
 
 
 def test_pixels_outside_of_their_image_are_refused_where_all_must_fit(said, facade):
@@ -131,7 +138,10 @@ def test_a_typo_in_a_control_point_is_named_before_the_solve(said, block):
 
 
 def test_pixels_most_of_which_lie_outside_are_refused(said, facade):
-    with pytest.raises(ProblemError, match=r"lie outside of .* \(6000 x 4000\), and \d+ more: photos of another size"):
+    with pytest.raises(
+        ProblemError,
+        match=r"lie outside of .* \(6000 x 4000\), and \d+ more: photos of another size",
+    ):
         said(facade, lambda survey: scaled(survey, 3.0))
 
 
@@ -139,5 +149,7 @@ def test_a_wrong_click_is_refused_where_all_must_fit(said, facade):
     def change(survey: Survey) -> None:
         survey.mark_pixels[3, 1] += [25.0, 10.0]
 
-    with pytest.raises(ProblemError, match=r"survey.yaml: control_points: rays of the same point do not meet"):
+    with pytest.raises(
+        ProblemError, match=r"survey.yaml: control_points: rays of the same point do not meet"
+    ):
         said(facade, change, strict=True)

@@ -39,7 +39,9 @@ def decades(config: AgentConfig, memory: Memory, action: float) -> float:
     return float(jnp.log10(damping_of(config, memory.guard, jnp.asarray(action, jnp.float32))))
 
 
-def after(config: AgentConfig, memory: Memory, accepted: bool, logdamping: float, **changes) -> Memory:
+def after(
+    config: AgentConfig, memory: Memory, accepted: bool, logdamping: float, **changes
+) -> Memory:
     """Memory after one step; a tenth of the cost goes where it is accepted."""
     before = float(memory.cost)
     values = {

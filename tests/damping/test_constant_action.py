@@ -22,8 +22,13 @@ from jaxba.solver.names import parse_solver
 
 def boldest_network(config: AgentConfig) -> LearnedPolicy:
     """No weights, and biases of which the hyperbolic tangent is -1 in float32."""
-    zero = [layer._replace(kernel=0 * layer.kernel, bias=0 * layer.bias) for layer in random_policy(0, config).layers]
-    return LearnedPolicy((*zero[:-1], zero[-1]._replace(bias=zero[-1].bias - np.float32(50))), config)
+    zero = [
+        layer._replace(kernel=0 * layer.kernel, bias=0 * layer.bias)
+        for layer in random_policy(0, config).layers
+    ]
+    return LearnedPolicy(
+        (*zero[:-1], zero[-1]._replace(bias=zero[-1].bias - np.float32(50))), config
+    )
 
 
 @functools.cache
@@ -47,11 +52,22 @@ def test_bolds_lambda_is_the_smallest_of_all_that_the_guard_allows():
     policy = make_policy("bold")
     config, wishes = policy.config, jnp.linspace(-1, 1, 9, dtype=jnp.float32)
     state, damping = begin(config, info()), policy.init(info())[1]
-    for accepted in (ACCEPTED, REJECTED, ACCEPTED, ACCEPTED, ACCEPTED, REJECTED, REJECTED, ACCEPTED):
+    for accepted in (
+        ACCEPTED,
+        REJECTED,
+        ACCEPTED,
+        ACCEPTED,
+        ACCEPTED,
+        REJECTED,
+        REJECTED,
+        ACCEPTED,
+    ):
         allowed = [float(damping_of(config, state.guard, wish)) for wish in wishes]
         assert float(damping) == min(allowed)
         state = after(config, state, accepted, float(jnp.log10(damping)))
-        damping = damping_of(config, state.guard, policy.act(jnp.zeros(observation_size(policy.config)))[0])
+        damping = damping_of(
+            config, state.guard, policy.act(jnp.zeros(observation_size(policy.config)))[0]
+        )
 
 
 def test_bold_falls_by_the_descent_to_the_lowest_and_rises_after_a_rejection():
@@ -62,7 +78,11 @@ def test_bold_falls_by_the_descent_to_the_lowest_and_rises_after_a_rejection():
         found.append(
             float(
                 jnp.log10(
-                    damping_of(policy.config, state.guard, policy.act(jnp.zeros(observation_size(policy.config)))[0])
+                    damping_of(
+                        policy.config,
+                        state.guard,
+                        policy.act(jnp.zeros(observation_size(policy.config)))[0],
+                    )
                 )
             )
         )
@@ -79,7 +99,9 @@ def test_an_action_between_the_bounds_is_played_as_it_is():
 def test_bold_has_the_step_of_rules_with_embedded_iterations():
     policy, options = parse_solver("bold").build()
     assert options.step_options(policy) == policy.step_options(StepOptions())
-    assert options.step_options(policy) == parse_solver("ceres+embedded").build()[1].step_options(make_policy("ceres"))
+    assert options.step_options(policy) == parse_solver("ceres+embedded").build()[1].step_options(
+        make_policy("ceres")
+    )
 
 
 @pytest.mark.parametrize("action", [-1.0, -0.25, 1.0])

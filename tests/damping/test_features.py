@@ -19,7 +19,10 @@ awkward = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e300, -1e300, np.nan, np.inf
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.sampled_from([0.0, 1e-300, 1.0, 1e300]), st.lists(st.tuples(st.booleans(), *[awkward] * 4), max_size=6))
+@given(
+    st.sampled_from([0.0, 1e-300, 1.0, 1e300]),
+    st.lists(st.tuples(st.booleans(), *[awkward] * 4), max_size=6),
+)
 def test_an_observation_is_finite_and_bounded_whatever_a_step_says(cost, steps):
     config = AgentConfig(history=3)
     memory = begin(config, info(max(cost, 1e-300)))
@@ -49,7 +52,9 @@ def test_an_observation_has_the_size_that_was_promised():
     for name in ("scale-free", "paper", "duration"):
         for history in range(1, 21):
             config = AgentConfig(observation=name, history=history)
-            seen = jax.eval_shape(lambda i, config=config: features.observe(config, features.begin(config, i)), info())
+            seen = jax.eval_shape(
+                lambda i, config=config: features.observe(config, features.begin(config, i)), info()
+            )
             assert seen.shape == (observation_size(config),)
             assert seen.dtype == jnp.float32
     assert observation_size(AgentConfig(observation="paper", history=7)) == 7

@@ -1,4 +1,5 @@
-"""Trained policies: their files, the network without flax, their names, and that a solve cannot suffer from them."""
+"""Trained policies: their files, the network without flax, their names, and that a solve cannot
+suffer from them."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ from jaxba.typing import InputError
 AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
 
 
-def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread: float = 1.0) -> LearnedPolicy:
+def random_policy(
+    seed: int, agent: AgentConfig = AGENT, width: int = 16, spread: float = 1.0
+) -> LearnedPolicy:
     """Two hidden layers of noise; its actions are anything in (-1, 1)."""
     rng = np.random.default_rng(seed)
     sizes = [observation_size(agent), width, width, 2]
@@ -56,7 +59,10 @@ def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread
 def test_a_policy_comes_back_from_its_file_bit_by_bit(tmp_path_factory, seed, observation, history):
     path = tmp_path_factory.mktemp("policy") / "some.safetensors"
     policy = random_policy(
-        seed, AgentConfig(observation=observation, history=history, guard="off", refinement=Refinement(trials=2))
+        seed,
+        AgentConfig(
+            observation=observation, history=history, guard="off", refinement=Refinement(trials=2)
+        ),
     )
     save_policy(path, policy, {"seed": str(seed)})
     found = load_policy(path)
@@ -81,7 +87,11 @@ def test_a_path_is_the_name_of_a_policy(tmp_path):
 
 
 def _tensors(policy: LearnedPolicy) -> dict[str, np.ndarray]:
-    return {f"layer{k}.{name}": x for k, layer in enumerate(policy.layers) for name, x in layer._asdict().items()}
+    return {
+        f"layer{k}.{name}": x
+        for k, layer in enumerate(policy.layers)
+        for name, x in layer._asdict().items()
+    }
 
 
 def _facts(**changes: str) -> dict[str, str]:
@@ -127,12 +137,23 @@ BAD = {
     "a bias that does not fit": (_changed("layer0.bias", lambda x: x[:-1]), _facts(), "layer 0"),
     "a flat kernel": (_changed("layer0.kernel", np.ravel), _facts(), "layer 0"),
     "three outputs": (
-        {**_changed("layer2.bias", lambda x: np.ones(3, np.float32)), "layer2.kernel": np.ones((16, 3), np.float32)},
+        {
+            **_changed("layer2.bias", lambda x: np.ones(3, np.float32)),
+            "layer2.kernel": np.ones((16, 3), np.float32),
+        },
         _facts(),
         "2 numbers, not 3",
     ),
-    "a weight that is not a number": (_changed("layer1.kernel", _with_nan), _facts(), "layer 1.*finite"),
-    "an infinite bias": (_changed("layer2.bias", lambda x: x + np.inf), _facts(), "layer 2.*finite"),
+    "a weight that is not a number": (
+        _changed("layer1.kernel", _with_nan),
+        _facts(),
+        "layer 1.*finite",
+    ),
+    "an infinite bias": (
+        _changed("layer2.bias", lambda x: x + np.inf),
+        _facts(),
+        "layer 2.*finite",
+    ),
     "whole numbers": (_changed("layer1.kernel", lambda x: x.astype(np.int32)), _facts(), "layer 1"),
     "no bias": (_without("layer1.bias"), _facts(), "layer1.bias"),
     "no tensors": ({}, _facts(), "."),
@@ -164,7 +185,9 @@ def test_a_path_that_is_no_file_is_refused_in_one_line(tmp_path):
     _refused(folder, "directory")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x00" * 7, b"\xff" * 64, b"PK\x03\x04" + b"\x00" * 100])
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"\x00" * 7, b"\xff" * 64, b"PK\x03\x04" + b"\x00" * 100]
+)
 def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path, content):
     path = tmp_path / "other.safetensors"
     path.write_bytes(content)
@@ -209,7 +232,9 @@ def test_its_action_is_that_of_the_trained_actor(layers):
     config = sac.SacConfig(width=24, layers=layers)
     size = observation_size(AGENT)
     actor = sac.init(config, jax.random.key(1), size, 1).actor
-    actor = jax.tree.map(lambda x, k: x + 0.3 * jax.random.normal(k, x.shape, x.dtype), actor, _keys(actor))
+    actor = jax.tree.map(
+        lambda x, k: x + 0.3 * jax.random.normal(k, x.shape, x.dtype), actor, _keys(actor)
+    )
     policy = learned_from(AGENT, actor)
     observations = jax.random.uniform(jax.random.key(2), (40, size), jnp.float32, -2, 2)
     expected = np.asarray(sac.act(config, actor, observations, None))
@@ -218,7 +243,9 @@ def test_its_action_is_that_of_the_trained_actor(layers):
     assert np.ptp(expected) > 0.1
     by_hand = np.asarray(observations, np.float64)
     for k, layer in enumerate(policy.layers):
-        by_hand = by_hand @ np.asarray(layer.kernel, np.float64) + np.asarray(layer.bias, np.float64)
+        by_hand = by_hand @ np.asarray(layer.kernel, np.float64) + np.asarray(
+            layer.bias, np.float64
+        )
         by_hand = by_hand if k == layers else np.maximum(by_hand, 0)
     np.testing.assert_allclose(found, np.tanh(by_hand[:, :1]), rtol=1e-4, atol=1e-5)
 
@@ -233,7 +260,8 @@ def _keys(tree):
 
 @pytest.fixture
 def shipped(tmp_path, monkeypatch):
-    """A policy with embedded iterations in the place of the shipped one, whose own file is not looked at."""
+    """A policy with embedded iterations in the place of the shipped one, whose own file is not
+    looked at."""
     file = tmp_path / "shipped.safetensors"
     save_policy(file, random_policy(0, replace(AGENT, refinement=Refinement(2, trials=3))))
     monkeypatch.setattr(registry, "SHIPPED", file)
@@ -286,7 +314,9 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned+refine0").build()
     chex.assert_trees_all_equal(policy.layers, load_policy(shipped).layers, strict=True)
     assert options == SolveOptions(refinement=Refinement(), coordinates=coordinates)
-    assert parse_solver("learned+refine3").build()[1] == replace(options, refinement=Refinement(points=3))
+    assert parse_solver("learned+refine3").build()[1] == replace(
+        options, refinement=Refinement(points=3)
+    )
     options = parse_solver("ceres+refine3").build()[1]
     assert options == SolveOptions(refinement=Refinement(points=3), coordinates=Coordinates())
     policy, options = parse_solver("ceres+embedded").build()
@@ -325,7 +355,11 @@ def test_another_policy_of_the_same_shape_compiles_nothing():
 def test_the_first_lambda_of_a_solve_is_the_network_s():
     policy = random_policy(1)
     flat = LearnedPolicy(
-        (*policy.layers[:-1], Layer(0 * policy.layers[-1].kernel, np.float32([np.arctanh(0.5), 0]))), AGENT
+        (
+            *policy.layers[:-1],
+            Layer(0 * policy.layers[-1].kernel, np.float32([np.arctanh(0.5), 0])),
+        ),
+        AGENT,
     )
     found = solve(scene(0), flat, max_iterations=40)
     np.testing.assert_allclose(

@@ -12,7 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import step_info
 
-from jaxba import POLICIES, Ceres, Classic, DampingPolicy, Geometric, ProblemInfo, Schedule, make_policy
+from jaxba import (
+    POLICIES,
+    Ceres,
+    Classic,
+    DampingPolicy,
+    Geometric,
+    ProblemInfo,
+    Schedule,
+    make_policy,
+)
 from jaxba.damping.policy import trained_step
 from jaxba.typing import InputError
 
@@ -31,7 +40,9 @@ def info(unit: float = 1.0, dtype=jnp.float64, observations: int = 100) -> Probl
     )
 
 
-def lambdas(policy: DampingPolicy, steps: list[tuple[bool, float]], unit: float = 1.0) -> list[float]:
+def lambdas(
+    policy: DampingPolicy, steps: list[tuple[bool, float]], unit: float = 1.0
+) -> list[float]:
     """First lambda, and the one after each (accepted, gain ratio)."""
     state, damping = policy.init(info(unit))
     found = [float(damping)]
@@ -99,7 +110,15 @@ def test_a_gain_that_is_not_a_number_is_a_rejection_like_any_other():
 
 
 def test_classic_halves_after_a_good_step_and_doubles_after_any_other():
-    steps = [(True, 1.0), (True, 0.41), (True, 0.4), (True, 0.1), REJECTED, (False, 0.9), (True, 5.0)]
+    steps = [
+        (True, 1.0),
+        (True, 0.41),
+        (True, 0.4),
+        (True, 0.1),
+        REJECTED,
+        (False, 0.9),
+        (True, 5.0),
+    ]
     assert lambdas(Classic(), steps) == [0.25, 0.125, 0.0625, 0.125, 0.25, 0.5, 1.0, 0.5]
     assert Classic().min_gain == 0
 
@@ -126,9 +145,13 @@ def test_nielsen_starts_in_units_of_the_largest_hessian_entry():
 
 def test_stba_goes_by_threes_and_theseus_by_nine_and_eleven():
     steps = [(True, 0.01), REJECTED, REJECTED]
-    np.testing.assert_allclose(lambdas(make_policy("stba"), steps), 1e-4 * np.array([1, 1 / 3, 1, 3]), rtol=1e-14)
     np.testing.assert_allclose(
-        lambdas(make_policy("theseus"), steps), 1e-3 * np.array([1, 1 / 9, 11 / 9, 121 / 9]), rtol=1e-14
+        lambdas(make_policy("stba"), steps), 1e-4 * np.array([1, 1 / 3, 1, 3]), rtol=1e-14
+    )
+    np.testing.assert_allclose(
+        lambdas(make_policy("theseus"), steps),
+        1e-3 * np.array([1, 1 / 9, 11 / 9, 121 / 9]),
+        rtol=1e-14,
     )
     assert make_policy("theseus").min_gain == 0.1
     assert lambdas(make_policy("theseus"), [(True, 1.0)] * 9)[-1] == 1e-7
@@ -151,7 +174,8 @@ def test_gauss_newton_is_next_to_no_damping():
 
 
 def played(policy: DampingPolicy, *steps: dict, observations: int = 100) -> list[float]:
-    """log10 of the first lambda, and of the one after each accepted step of full length with these changes."""
+    """log10 of the first lambda, and of the one after each accepted step of full length with these
+    changes."""
     state, damping = policy.init(info(observations=observations))
     found = [float(jnp.log10(damping))]
     for changes in steps:
@@ -161,12 +185,14 @@ def played(policy: DampingPolicy, *steps: dict, observations: int = 100) -> list
     return found
 
 
-def test_guarded_is_at_its_least_lambda_after_the_first_step_and_half_a_decade_higher_for_each_failure():
+def test_guarded_starts_at_its_least_lambda_and_rises_half_a_decade_for_each_failure():
     full, rejected, shortened = {}, {"accepted": False, "gain": -1.0}, {"step_fraction": 1 / 16}
     inexact, pattern = {"forcing": 0.1, "damping_fraction": 9e-3}, {"step_fraction": 2.0}
     found = played(make_policy("guarded"), full, rejected, full, shortened, inexact, pattern, full)
     np.testing.assert_allclose(found, [-6, -8, -7.5, -8, -7, -7, -8, -8], atol=1e-12)
-    above = played(make_policy("guarded:1e-5"), full, rejected, full, shortened, inexact, pattern, full)
+    above = played(
+        make_policy("guarded:1e-5"), full, rejected, full, shortened, inexact, pattern, full
+    )
     np.testing.assert_allclose(above, [-5, *found[1:]], atol=1e-12)
     twice = played(make_policy("guarded"), shortened, shortened, rejected, full)
     np.testing.assert_allclose(twice, [-6, -5, -4, -3.5, -8], atol=1e-12)
@@ -182,12 +208,18 @@ def test_guarded_gives_way_to_ceres_rule_after_two_rejections_in_a_row_or_eight_
     rejected, perfect = {"accepted": False, "gain": np.nan}, {"gain": 1.0}
     third, two = np.log10(1 / 3), np.log10(2)
     found = played(make_policy("guarded"), rejected, rejected, perfect, rejected, rejected, perfect)
-    ceres = -4 + np.cumsum([0, third, two])  # begins again where the last accepted step was, if no larger one failed
-    np.testing.assert_allclose(found, [-6, -5.5, *ceres, -4 + third + 3 * two, -4 + 2 * third + 3 * two], atol=1e-12)
-    worked = played(make_policy("guarded"), {"damping": 1e-2}, {"damping": 1e-7, **rejected}, {**rejected})
+    # begins again where the last accepted step was, if no larger one failed
+    ceres = -4 + np.cumsum([0, third, two])
+    np.testing.assert_allclose(
+        found, [-6, -5.5, *ceres, -4 + third + 3 * two, -4 + 2 * third + 3 * two], atol=1e-12
+    )
+    worked = played(
+        make_policy("guarded"), {"damping": 1e-2}, {"damping": 1e-7, **rejected}, {**rejected}
+    )
     np.testing.assert_allclose(worked[-1], -2, atol=1e-12)
     found = played(make_policy("guarded"), *[rejected, perfect] * 8)
-    np.testing.assert_allclose(found, [-6, -5.5, *[-8, -7.5] * 6, -8, -8 + two, -8], atol=1e-12)  # never less
+    # never less
+    np.testing.assert_allclose(found, [-6, -5.5, *[-8, -7.5] * 6, -8, -8 + two, -8], atol=1e-12)
 
 
 def test_guarded_has_the_step_of_the_agents():

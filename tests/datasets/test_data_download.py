@@ -1,4 +1,5 @@
-"""Downloads against a server of this process: what is asked of it, what is kept, and what is refused."""
+"""Downloads against a server of this process: what is asked of it, what is kept, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -25,9 +26,12 @@ from jaxba.datasets.bal.paths import Entry, select
 
 
 def packed(cameras: int, points: int, seed: int = 0) -> bytes:
-    """A compressed file with the header of such a problem, some hundred kB of digits, and nothing to solve."""
+    """A compressed file with the header of such a problem, some hundred kB of digits, and nothing
+    to solve."""
     digits = np.random.default_rng(seed).integers(0, 10**9, size=60_000)
-    return bz2.compress(f"{cameras} {points} {len(digits)}\n".encode() + "\n".join(map(str, digits)).encode())
+    return bz2.compress(
+        f"{cameras} {points} {len(digits)}\n".encode() + "\n".join(map(str, digits)).encode()
+    )
 
 
 BODY = packed(7, 30)
@@ -142,7 +146,9 @@ def test_what_another_process_received_while_this_one_waited_is_used(server, fol
 
 
 @pytest.mark.parametrize("entry", [ENTRY, UNSIGNED])
-def test_a_download_is_the_servers_file_byte_by_byte_and_nothing_else_is_left(server, folder, entry):
+def test_a_download_is_the_servers_file_byte_by_byte_and_nothing_else_is_left(
+    server, folder, entry
+):
     path, new = get(server, folder, entry)
     assert new
     assert path == folder / "ladybug" / "problem-7-30-pre.txt.bz2"
@@ -161,7 +167,9 @@ def test_a_second_run_uses_the_cache_without_any_request(server, folder, entry):
     assert server.asked == []
 
 
-def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(server, folder, monkeypatch):
+def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(
+    server, folder, monkeypatch
+):
     """The first one holds its file until the second one has come to the lock."""
     fcntl = pytest.importorskip("fcntl")
     waits, results, lock = threading.Event(), [], fcntl.flock
@@ -186,7 +194,9 @@ def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(server,
     assert files(folder) == [ENTRY.file]
 
 
-def test_progress_ends_at_the_size_of_the_file_and_counts_what_was_there(server, folder, monkeypatch):
+def test_progress_ends_at_the_size_of_the_file_and_counts_what_was_there(
+    server, folder, monkeypatch
+):
     monkeypatch.setattr(download, "BLOCK_BYTES", 1 << 14)
     break_off(server, folder, after=100_000)
     seen: list = []
@@ -200,7 +210,9 @@ def test_progress_ends_at_the_size_of_the_file_and_counts_what_was_there(server,
 
 
 @pytest.mark.parametrize("entry", [ENTRY, UNSIGNED])
-def test_a_download_that_broke_off_leaves_no_final_file_and_goes_on_with_the_rest_alone(server, folder, entry):
+def test_a_download_that_broke_off_leaves_no_final_file_and_goes_on_with_the_rest_alone(
+    server, folder, entry
+):
     break_off(server, folder, 100_000, entry)
     assert files(folder) == [str(partial_path(ENTRY, folder).relative_to(folder))]
     assert not list(folder.rglob("problem-*"))
@@ -248,10 +260,14 @@ def test_a_leftover_of_another_file_is_refused_and_the_next_run_gets_the_right_o
 # What is refused
 
 
-@pytest.mark.parametrize("body", [packed(7, 30, seed=1), BODY[:-1000], b"<html>log in first</html>", b""])
+@pytest.mark.parametrize(
+    "body", [packed(7, 30, seed=1), BODY[:-1000], b"<html>log in first</html>", b""]
+)
 def test_a_file_with_another_checksum_is_refused_and_removed(server, folder, body):
     server.files[f"/{ENTRY.file}"] = body
-    with pytest.raises(DownloadError, match=r"problem-7-30-pre\.txt\.bz2: the file has a wrong checksum"):
+    with pytest.raises(
+        DownloadError, match=r"problem-7-30-pre\.txt\.bz2: the file has a wrong checksum"
+    ):
         get(server, folder)
     assert files(folder) == []
 
@@ -275,9 +291,13 @@ def test_a_stored_file_that_has_changed_is_downloaded_again(server, folder):
         (b"<html>log in first</html>", "no bz2 file"),
     ],
 )
-def test_without_a_checksum_damage_and_a_foreign_header_are_found_and_removed(server, folder, body, why):
+def test_without_a_checksum_damage_and_a_foreign_header_are_found_and_removed(
+    server, folder, body, why
+):
     server.files[f"/{ENTRY.file}"] = body
-    with pytest.raises(DownloadError, match=rf"^ladybug-7: what came is not the problem and was removed: .*{why}"):
+    with pytest.raises(
+        DownloadError, match=rf"^ladybug-7: what came is not the problem and was removed: .*{why}"
+    ):
         get(server, folder, UNSIGNED)
     assert files(folder) == []
 
@@ -292,7 +312,9 @@ def test_a_mirror_that_compressed_anew_is_accepted_only_on_demand(server, folder
 
 def test_a_missing_file_is_told_with_the_servers_words_and_leaves_nothing(server, folder):
     server.files.clear()
-    with pytest.raises(DownloadError, match=r"problem-7-30-pre\.txt\.bz2: the server answers 404 Not Found"):
+    with pytest.raises(
+        DownloadError, match=r"problem-7-30-pre\.txt\.bz2: the server answers 404 Not Found"
+    ):
         get(server, folder)
     assert files(folder) == []
 
@@ -314,7 +336,9 @@ def test_a_silent_server_is_given_up(folder, monkeypatch):
     monkeypatch.setattr(download, "TIMEOUT_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(UnreachableError, match=r"cannot reach 127.0.0.1:\d+: no answer in 0.2 s"):
+        with pytest.raises(
+            UnreachableError, match=r"cannot reach 127.0.0.1:\d+: no answer in 0.2 s"
+        ):
             fetch(ENTRY, folder, lambda *_: None, url)
     assert files(folder) == []
 
@@ -323,7 +347,18 @@ def test_a_silent_server_is_given_up(folder, monkeypatch):
 
 
 def test_without_a_network_the_command_says_so_once_and_leaves_nothing(folder, capsys):
-    assert run(["download", "trafalgar", "ladybug-49", "--base-url", f"http://127.0.0.1:{_closed_port()}"]) == 2
+    assert (
+        run(
+            [
+                "download",
+                "trafalgar",
+                "ladybug-49",
+                "--base-url",
+                f"http://127.0.0.1:{_closed_port()}",
+            ]
+        )
+        == 2
+    )
     check_one_line(capsys.readouterr().err, "Connection refused; is there a network?")
     assert files(folder) == []
 
@@ -334,7 +369,10 @@ def test_a_name_that_cannot_be_resolved_is_one_line(folder, capsys, monkeypatch)
 
     monkeypatch.setattr(socket, "getaddrinfo", fail)
     assert run(["download", "ladybug-49", "--base-url", "http://bal.invalid"]) == 2
-    check_one_line(capsys.readouterr().err, "cannot reach bal.invalid: Name or service not known; is there a network?")
+    check_one_line(
+        capsys.readouterr().err,
+        "cannot reach bal.invalid: Name or service not known; is there a network?",
+    )
     assert files(folder) == []
 
 
@@ -354,7 +392,9 @@ def test_one_bad_file_does_not_keep_the_others_from_coming(server, folder, capsy
     assert files(folder) == [select(["ladybug-1723"])[0].file]
 
 
-def test_ctrl_c_keeps_what_has_come_and_the_same_command_goes_on(server, folder, capsys, monkeypatch):
+def test_ctrl_c_keeps_what_has_come_and_the_same_command_goes_on(
+    server, folder, capsys, monkeypatch
+):
     (name,) = select(["ladybug-1723"])
     server.files["/" + name.file] = packed(1723, 156502)
     monkeypatch.setattr(download, "BLOCK_BYTES", 1 << 14)
@@ -379,10 +419,16 @@ def test_ctrl_c_keeps_what_has_come_and_the_same_command_goes_on(server, folder,
 
 @support.needs_data
 @pytest.mark.parametrize(
-    ("name", "file"), [("ladybug-49", "problem-49-7776-pre"), ("trafalgar-21", "problem-21-11315-pre")]
+    ("name", "file"),
+    [("ladybug-49", "problem-49-7776-pre"), ("trafalgar-21", "problem-21-11315-pre")],
 )
-def test_the_real_files_have_the_stated_checksums_and_are_the_problems_of_their_names(server, folder, name, file):
+def test_the_real_files_have_the_stated_checksums_and_are_the_problems_of_their_names(
+    server, folder, name, file
+):
     server.files["/" + select([name])[0].file] = support.bal_file(file).read_bytes()
     assert run(["download", name, "--base-url", server.url]) == 0
     problem = read_bal(folder / select([name])[0].file)
-    assert (problem.num_cameras, problem.num_points) == (select([name])[0].cameras, select([name])[0].points)
+    assert (problem.num_cameras, problem.num_points) == (
+        select([name])[0].cameras,
+        select([name])[0].points,
+    )

@@ -53,7 +53,11 @@ def test_the_catalogue_holds_the_data_sets_families_in_full():
 
 
 def test_names_and_files_are_unique_and_in_the_order_of_size():
-    assert len({entry.name for entry in ENTRIES}) == len({Path(entry.file).name for entry in ENTRIES}) == 98
+    assert (
+        len({entry.name for entry in ENTRIES})
+        == len({Path(entry.file).name for entry in ENTRIES})
+        == 98
+    )
     assert list(ENTRIES) == select([*dict.fromkeys(entry.family for entry in ENTRIES)])
     for family in ("ladybug", "trafalgar", "dubrovnik", "venice", "final"):
         sizes = [entry.cameras for entry in select([family])]
@@ -66,7 +70,9 @@ def test_checksums_are_64_hexadecimal_digits_all_different():
     assert all(len(text) == 64 and set(text) <= set("0123456789abcdef") for text in known)
 
 
-@pytest.mark.parametrize("name", [name for name in LIKE if name.partition("-")[0] in {e.family for e in ENTRIES}])
+@pytest.mark.parametrize(
+    "name", [name for name in LIKE if name.partition("-")[0] in {e.family for e in ENTRIES}]
+)
 def test_random_scenes_named_after_problems_have_their_sizes(name):
     (entry,) = select([name])
     assert (entry.cameras, entry.points) == (LIKE[name].cameras, LIKE[name].points)
@@ -118,7 +124,9 @@ def test_a_file_of_the_same_name_wins(stored):
     assert resolve("ladybug-49") == "ladybug-49"
 
 
-@pytest.mark.parametrize("location", ["scene:tiny", "ladybug-49.txt", "x/ladybug-49", "ladybug", "problem-49-7776-pre"])
+@pytest.mark.parametrize(
+    "location", ["scene:tiny", "ladybug-49.txt", "x/ladybug-49", "ladybug", "problem-49-7776-pre"]
+)
 def test_what_has_not_the_form_of_a_name_stays_a_path(folder, location):
     assert resolve(location) == location
 
@@ -171,14 +179,20 @@ def test_download_without_names_and_without_requests_are_one_line(folder, capsys
 
 def test_solve_takes_a_name(stored, tmp_path, capsys):
     log = tmp_path / "log.json"
-    assert solve.run(["ladybug-49", "--policy", "ceres", "--max-iterations", "1", "--log", str(log)]) == 0
-    assert capsys.readouterr().out.startswith("ladybug-49: 6 cameras, 40 points, 200 observations\n")
+    assert (
+        solve.run(["ladybug-49", "--policy", "ceres", "--max-iterations", "1", "--log", str(log)])
+        == 0
+    )
+    assert capsys.readouterr().out.startswith(
+        "ladybug-49: 6 cameras, 40 points, 200 observations\n"
+    )
     assert json.loads(log.read_text())["problem"] == "ladybug-49"
 
 
 @pytest.mark.parametrize("command", [solve.run, bench.run])
 @pytest.mark.parametrize(
-    ("name", "message"), [("ladybug-49", "jaxba-data download ladybug-49"), ("ladybug-50", "did you mean ladybug-49")]
+    ("name", "message"),
+    [("ladybug-49", "jaxba-data download ladybug-49"), ("ladybug-50", "did you mean ladybug-49")],
 )
 def test_a_name_that_is_not_here_says_what_to_do(folder, capsys, command, name, message):
     assert command([name]) == 2
@@ -198,6 +212,11 @@ def test_benchmarks_keep_the_name_and_the_family(stored):
 
 def test_suites_may_name_problems(stored, tmp_path, capsys):
     suite = tmp_path / "suite.yaml"
-    suite.write_text(yaml.safe_dump({"problems": ["ladybug-49", "trafalgar-21"], "solvers": ["ceres"]}))
+    suite.write_text(
+        yaml.safe_dump({"problems": ["ladybug-49", "trafalgar-21"], "solvers": ["ceres"]})
+    )
     assert bench.run(["--suite", str(suite), "--out", str(tmp_path / "out")]) == 2
-    check_one_line(capsys.readouterr().err, "trafalgar-21 is not here; get it with: jaxba-data download trafalgar-21")
+    check_one_line(
+        capsys.readouterr().err,
+        "trafalgar-21 is not here; get it with: jaxba-data download trafalgar-21",
+    )

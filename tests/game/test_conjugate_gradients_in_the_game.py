@@ -1,4 +1,5 @@
-"""Conjugate gradients inside the game: the steps of the paper's agent are those of dense algebra."""
+"""Conjugate gradients inside the game: the steps of the paper's agent are those of dense
+algebra."""
 
 from __future__ import annotations
 
@@ -38,8 +39,11 @@ def test_a_vmapped_step_of_the_papers_scenes_is_that_of_dense_algebra():
     assert iterative.linear_solver == "cg"
     dense = replace(iterative, linear_solver="explicit")
     for decades, distance in ((-10.0, 1e-4), (-2.0, 1e-7)):
-        (found, truth) = (run(options, jnp.asarray(10.0**decades)) for options in (iterative, dense))
-        # d.(H + D) d of the solution less that of an iterate is the squared energy norm of what it lacks
+        (found, truth) = (
+            run(options, jnp.asarray(10.0**decades)) for options in (iterative, dense)
+        )
+        # d.(H + D) d of the solution less that of an iterate is the squared energy norm of what it
+        # lacks
         lacking = np.sqrt(np.abs(np.asarray(1 - found.slope / truth.slope)))
         assert lacking.shape == (SCENES,)
         assert np.max(lacking) < distance

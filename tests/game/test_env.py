@@ -37,14 +37,17 @@ def _host(tree):
 
 @functools.cache
 def random_game():
-    """What happens in 50 steps of random actions: pairs of the state before and the step, all on the host."""
+    """What happens in 50 steps of random actions: pairs of the state before and the step, all on
+    the host."""
     game = tiny_game(RULES, ENVS)
     state, seen = _jitted_reset(game, jax.random.key(3))
     found = []
     for action in actions(50):
         before = state
         state, step = _jitted_step(game, state, action)
-        found.append((before._replace(episodes=_host(before.episodes)), *_host((seen, action, step))))
+        found.append(
+            (before._replace(episodes=_host(before.episodes)), *_host((seen, action, step)))
+        )
         seen = step.observation
     return game, found
 
@@ -52,10 +55,19 @@ def random_game():
 def test_the_game_keeps_the_contract_of_an_environment():
     game, found = random_game()
     assert isinstance(game, Environment)
-    assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, observation_size(AGENT) + 1, 1)
+    assert (game.num_envs, game.observation_size, game.action_size) == (
+        ENVS,
+        observation_size(AGENT) + 1,
+        1,
+    )
     assert game.privileged_size == 1
     for _, seen, _, step in found:
-        assert seen.shape == step.observation.shape == step.final_observation.shape == (ENVS, game.observation_size)
+        assert (
+            seen.shape
+            == step.observation.shape
+            == step.final_observation.shape
+            == (ENVS, game.observation_size)
+        )
         assert seen.dtype == step.observation.dtype == step.reward.dtype == np.float32
         assert set(step.metrics) == {"length", "success", "rejections", "ceres"}
 
@@ -74,7 +86,9 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
     for k, (before, _, action, step) in enumerate(found):
         episodes = before.episodes
         best = np.asarray(bank.best_cost)[episodes.scene]
-        cost = np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
+        cost = (
+            np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
+        )
         at_limit = episodes.memory.iteration + 1 >= RULES.max_iterations
         success = step.metrics["success"] > 0
         if cost is not None:
@@ -117,9 +131,15 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
                 np.testing.assert_array_equal(step.observation[e], step.final_observation[e])
             if k < 6:
                 episode = jax.tree.map(lambda x, e=e: jnp.asarray(x[e]), before.episodes)
-                after, _ = _iterate(game, game.bank, episode, jnp.asarray(action[e, 0]), game.config)
-                np.testing.assert_allclose(step.final_observation[e], game._observe(game.bank, after), atol=1e-5)
-                np.testing.assert_allclose(step.final_observation[e, :-1], observe(AGENT, after.memory), atol=1e-5)
+                after, _ = _iterate(
+                    game, game.bank, episode, jnp.asarray(action[e, 0]), game.config
+                )
+                np.testing.assert_allclose(
+                    step.final_observation[e], game._observe(game.bank, after), atol=1e-5
+                )
+                np.testing.assert_allclose(
+                    step.final_observation[e, :-1], observe(AGENT, after.memory), atol=1e-5
+                )
                 distance = after.state.cost / game.bank.best_cost[after.scene] - 1
                 decades = np.log10(np.maximum(distance, 1e-6)) / 6
                 np.testing.assert_allclose(step.final_observation[e, -1], decades, atol=1e-4)
@@ -127,14 +147,17 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
             following = found[k + 1][0].episodes
             assert (following.memory.iteration[done] == 0).all()
             np.testing.assert_array_equal(
-                following.state.cost[done], np.asarray(tiny_bank().initial_cost)[following.scene[done]]
+                following.state.cost[done],
+                np.asarray(tiny_bank().initial_cost)[following.scene[done]],
             )
     assert ended >= 30
     scenes = {int(s) for before, *_ in found for s in before.episodes.scene}
     assert len(scenes) > 10  # of the whole bank, not the same ones again
 
 
-def _reward(config: GameConfig, cost: float, best: float, iteration: int, success: bool, time: float = 1.0):
+def _reward(
+    config: GameConfig, cost: float, best: float, iteration: int, success: bool, time: float = 1.0
+):
     """By hand; `iteration` counts from one, `time` is what the clock says."""
     bonus = config.bonus if success else 0.0
     value = {
@@ -194,7 +217,9 @@ def test_the_game_pays_what_it_says():
         for e in range(ENVS):
             success = bool(step.metrics["success"][e])
             best = float(np.asarray(tiny_bank().best_cost)[episodes.scene[e]])
-            cost = best if step.terminated[e] or step.truncated[e] else float(following.state.cost[e])
+            cost = (
+                best if step.terminated[e] or step.truncated[e] else float(following.state.cost[e])
+            )
             want = _reward(game.config, cost, best, int(step.metrics["length"][e]), success)
             np.testing.assert_allclose(step.reward[e], want, rtol=1e-5)
             checked += 1
@@ -227,7 +252,11 @@ def test_demonstrations_are_actions_of_which_some_follow_ceres_rule():
     assert (np.abs(found) < 1).all()
     lambdas = [
         float(
-            damping_of(AGENT, jax.tree.map(lambda x, e=e: x[e], state.episodes.memory.guard), jnp.asarray(found[e, 0]))
+            damping_of(
+                AGENT,
+                jax.tree.map(lambda x, e=e: x[e], state.episodes.memory.guard),
+                jnp.asarray(found[e, 0]),
+            )
         )
         for e in range(8)
     ]

@@ -1,4 +1,5 @@
-"""The game as Gymnasium environments: their checker, their conventions, and the same numbers as the game itself."""
+"""The game as Gymnasium environments: their checker, their conventions, and the same numbers as the
+game itself."""
 
 from __future__ import annotations
 
@@ -68,7 +69,9 @@ def test_the_vector_environment_says_what_it_is(envs, game):
 
 
 def test_errors_as_observations_have_no_bounds(game):
-    rules = dataclasses.replace(game.config, agent=dataclasses.replace(game.config.agent, observation="paper"))
+    rules = dataclasses.replace(
+        game.config, agent=dataclasses.replace(game.config.agent, observation="paper")
+    )
     space = GymVectorGame(dataclasses.replace(game, config=rules)).single_observation_space
     assert space.shape == (game.config.agent.history,)
     assert np.isposinf(space.high).all()
@@ -122,7 +125,9 @@ def test_its_numbers_are_the_game_s(envs, game):
         np.testing.assert_array_equal(terminated, want.terminated)
         np.testing.assert_array_equal(truncated, want.truncated)
         for k in np.flatnonzero(terminated | truncated):
-            np.testing.assert_allclose(infos["final_obs"][k], want.final_observation[k, :-1], atol=1e-6)
+            np.testing.assert_allclose(
+                infos["final_obs"][k], want.final_observation[k, :-1], atol=1e-6
+            )
 
 
 def test_a_seed_decides_everything_and_no_seed_goes_on(envs):
@@ -154,7 +159,9 @@ def test_actions_beyond_the_space_are_its_bounds(envs):
     np.testing.assert_array_equal(beyond, envs.step(np.ones((6, 1)))[1])
 
 
-@pytest.mark.parametrize(("actions", "words"), [(np.zeros(6), "shape"), (np.full((6, 1), np.nan), "finite")])
+@pytest.mark.parametrize(
+    ("actions", "words"), [(np.zeros(6), "shape"), (np.full((6, 1), np.nan), "finite")]
+)
 def test_actions_that_make_no_sense_are_refused(envs, actions, words):
     envs.reset(seed=1)
     with pytest.raises(ValueError, match=words):
@@ -219,14 +226,17 @@ def test_wrappers_that_ask_for_the_next_step_take_what_is_made_by_default(game):
 
 
 def play(game, mode, steps):
-    """Rows of observations, rewards and ends, and the metrics of episodes by step, with the same action everywhere."""
+    """Rows of observations, rewards and ends, and the metrics of episodes by step, with the same
+    action everywhere."""
     envs = GymVectorGame(game, mode)
     rows = [envs.reset(seed=4)[0]]
     rewards = []
     ends = []
     infos = []
     for _ in range(steps):
-        observation, reward, terminated, truncated, info = envs.step(np.full((6, 1), 0.3, np.float32))
+        observation, reward, terminated, truncated, info = envs.step(
+            np.full((6, 1), 0.3, np.float32)
+        )
         rows.append(observation)
         rewards.append(reward)
         ends.append(terminated | truncated)
@@ -242,10 +252,15 @@ def test_episodes_are_the_same_whether_they_begin_in_the_same_step_or_in_the_nex
         np.testing.assert_array_equal(np.flatnonzero(ends[:, k])[:2], [first, second + 1])
         np.testing.assert_array_equal(rows[: first + 1, k], same_rows[: first + 1, k])
         np.testing.assert_array_equal(rows[first + 1, k], same_infos[first]["final_obs"][k])
-        np.testing.assert_array_equal(rows[first + 2, k], same_rows[first + 1, k])  # the next episode begins
-        np.testing.assert_array_equal(rows[first + 2 : second + 2, k], same_rows[first + 1 : second + 1, k])
+        # the next episode begins
+        np.testing.assert_array_equal(rows[first + 2, k], same_rows[first + 1, k])
+        np.testing.assert_array_equal(
+            rows[first + 2 : second + 2, k], same_rows[first + 1 : second + 1, k]
+        )
         assert rewards[first + 1, k] == 0
-        np.testing.assert_array_equal(np.delete(rewards[: second + 2, k], first + 1), same_rewards[: second + 1, k])
+        np.testing.assert_array_equal(
+            np.delete(rewards[: second + 2, k], first + 1), same_rewards[: second + 1, k]
+        )
         for name, values in same_infos[first]["final_info"].items():
             assert infos[first][name][k] == values[k]
         assert infos[first]["_length"][k]
@@ -261,7 +276,9 @@ def test_another_mode_is_refused(game):
 @pytest.mark.parametrize("module", ["jaxba", "jaxba.game.gym"])
 def test_gymnasium_knows_the_game_once_a_module_is_imported(module):
     script = f"import gymnasium, {module}; print(gymnasium.spec({gym.ID!r}).vector_entry_point)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
+    )
     assert done.stdout == "jaxba.training.api:gym_vector_env\n", done.stderr
 
 
@@ -299,7 +316,9 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(("context", "words"), [("fork", 'AsyncVectorEnv(..., context="spawn")')])
 def test_a_forked_worker_says_at_once_how_to_begin_it(tmp_path, context, words):
     script = tmp_path / "workers.py"
-    script.write_text(WORKERS.format(path=[str(Path(__file__).parent.parent), str(Path(__file__).parents[2])]))
+    script.write_text(
+        WORKERS.format(path=[str(Path(__file__).parent.parent), str(Path(__file__).parents[2])])
+    )
     command = [sys.executable, str(script), context]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert words in done.stdout, done.stdout + done.stderr

@@ -1,4 +1,5 @@
-"""Random scenes of the game: shapes, costs by NumPy (`geometry`), and what a policy is told of them."""
+"""Random scenes of the game: shapes, costs by NumPy (`geometry`), and what a policy is told of
+them."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ LARGE = pytest.param(SceneClass(MOST_CAMERAS, MOST_POINTS), marks=pytest.mark.sl
 """The largest class of scenes; forty of them are 1.1 million slots."""
 
 
-@pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE])
+@pytest.mark.parametrize(
+    "kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE]
+)
 def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
     scenes = make_scenes(kind, jax.random.key(1), 40)
     slots = kind.cameras * (kind.points + 1)
@@ -31,7 +34,9 @@ def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
     assert shapes == [(40, 9, kind.cameras), (40, 3, kind.points + 1), (40, 2, slots), (40, slots)]
     assert all(np.isfinite(x).all() for x in scenes[:3])
     mask = np.asarray(scenes.mask)
-    assert (np.asarray(scenes.pixels)[np.broadcast_to(~mask[:, None], scenes.pixels.shape)] == 0).all()
+    assert (
+        np.asarray(scenes.pixels)[np.broadcast_to(~mask[:, None], scenes.pixels.shape)] == 0
+    ).all()
     assert not mask.reshape(40, kind.cameras, -1)[:, :, -1].any()  # the empty point
     seen = grid(kind, scenes)
     views, observed = seen.sum(axis=1), seen.sum(axis=2)
@@ -45,7 +50,9 @@ def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
 
 @pytest.mark.parametrize("sizes", [(MOST_CAMERAS + 1, 40), (10, MOST_POINTS + 1), (3, 40), (10, 9)])
 def test_a_class_that_is_too_large_or_too_small_is_refused(sizes):
-    with pytest.raises(ValueError, match="a class of scenes has 4 to 56 cameras and 10 to 510 points, not"):
+    with pytest.raises(
+        ValueError, match="a class of scenes has 4 to 56 cameras and 10 to 510 points, not"
+    ):
         SceneClass(*sizes)
 
 
@@ -70,7 +77,8 @@ def test_the_paper_s_cameras_stand_at_random_around_its_points():
     centers = np.stack([geometry.camera_centers(c.T) for c in cameras]).reshape(-1, 3)
     distance = np.linalg.norm(centers, axis=1)
     assert 8.5 < distance.mean() < 11  # 9 and its error
-    assert (np.abs((centers / distance[:, None]).mean(axis=0)) < 0.15).all()  # 240 directions; sigma of a mean 0.04
+    # 240 directions; sigma of a mean 0.04
+    assert (np.abs((centers / distance[:, None]).mean(axis=0)) < 0.15).all()
     assert (cameras[:, 6:] == np.array([500, 0, 0])[:, None]).all()
     assert 0.95 < np.std(points) / np.hypot(4 / np.sqrt(12), PAPER_START[2]) < 1.05
 
@@ -92,6 +100,8 @@ def test_what_a_policy_is_told_of_a_scene_is_true():
         assert int(info.observations[k]) == seen.sum()
         assert int(info.cameras[k]) == seen.any(axis=1).sum()
         assert int(info.points[k]) == seen.any(axis=0).sum()
-        np.testing.assert_allclose(info.focal[k], np.median(np.asarray(scenes.cameras)[k, 6, seen.any(axis=1)]))
+        np.testing.assert_allclose(
+            info.focal[k], np.median(np.asarray(scenes.cameras)[k, 6, seen.any(axis=1)])
+        )
         assert int(info.max_iterations[k]) == 33
         assert info.cost[k] == cost[k]

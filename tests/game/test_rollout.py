@@ -16,7 +16,14 @@ from jaxba import StepOptions, make_method, make_policy
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import Layer, LearnedPolicy, always
 from jaxba.game.env import GameConfig
-from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
+from jaxba.game.evaluate import (
+    CONSTANT_ACTIONS,
+    best_constant_action,
+    evaluate,
+    play_all,
+    score,
+    scores,
+)
 from jaxba.game.random_scenes import (
     MOST_CAMERAS,
     MOST_POINTS,
@@ -55,7 +62,9 @@ def test_a_scene_is_played_as_it_is_solved():
         count = min(5, alone.iterations)
         expected = np.concatenate([[alone.initial_cost], alone.history.cost])[: count + 1]
         np.testing.assert_allclose(found.costs[k, : count + 1], expected, rtol=1e-6)
-        np.testing.assert_allclose(found.dampings[k, :count], alone.history.damping[:count], rtol=1e-4)
+        np.testing.assert_allclose(
+            found.dampings[k, :count], alone.history.damping[:count], rtol=1e-4
+        )
         if alone.converged:
             np.testing.assert_allclose(found.costs[k, -1], alone.final_cost, rtol=1e-3)
 
@@ -67,7 +76,9 @@ def test_a_scene_is_played_as_it_is_solved_by_a_method():
     for k in (0, 5):
         alone = solve(problem_of(KIND, bank.scenes, k), "ceres", options, max_iterations=6)
         count = min(4, alone.iterations)
-        np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
+        np.testing.assert_allclose(
+            found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5
+        )
 
 
 @pytest.mark.parametrize("count", [3, GROUP + 1])
@@ -77,23 +88,32 @@ def test_agents_that_play_side_by_side_step_in_groups_as_each_alone(count):
     step = lambda x, y: step_groups(one, x, y, shared=shared)
     found = jax.jit(jax.vmap(step, (0, None)))(scenes, scenes[0])
     for agent in range(3):
-        chex.assert_trees_all_equal(jax.tree.map(lambda x, k=agent: x[k], found), step(scenes[agent], scenes[0]))
+        chex.assert_trees_all_equal(
+            jax.tree.map(lambda x, k=agent: x[k], found), step(scenes[agent], scenes[0])
+        )
     np.testing.assert_array_equal(found[0], 2 * scenes + 3 * scenes[0])
 
 
 @pytest.mark.slow
 def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
     """As no preset has them."""
-    kind, options = SceneClass(MOST_CAMERAS, MOST_POINTS), StepOptions(refinement=Refinement(points=3))
+    kind, options = (
+        SceneClass(MOST_CAMERAS, MOST_POINTS),
+        StepOptions(refinement=Refinement(points=3)),
+    )
     scenes = make_scenes(kind, jax.random.key(5), 4)
     costs = initial_costs(kind, scenes)
-    found = play(kind, Bank(scenes, costs, costs, info_of(kind, scenes, costs, 6), costs), CERES, options, 6)
+    found = play(
+        kind, Bank(scenes, costs, costs, info_of(kind, scenes, costs, 6), costs), CERES, options, 6
+    )
     whole = [k for k in range(4) if grid(kind, scenes)[k].any()]
     assert len(whole) >= 2
     for k in whole[:2]:
         alone = solve(problem_of(kind, scenes, k), "ceres", options, max_iterations=6)
         count = min(4, alone.iterations)
-        np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
+        np.testing.assert_allclose(
+            found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5
+        )
 
 
 @pytest.mark.slow
@@ -110,12 +130,17 @@ def test_scenes_of_a_class_share_random_clusters():
 
 @pytest.mark.slow
 def test_scenes_whose_steps_have_trials_and_rounds_are_played_as_each_alone():
-    """Candidates and camera rounds, vectorised over scenes: the same as one scene after the other."""
+    """Candidates and camera rounds, vectorised over scenes: the same as one scene after the
+    other."""
     bank, damping = tiny_bank(), 1e-6
-    options = StepOptions(refinement=Refinement(points=2, trials=3, camera_rounds=2, pattern_moves=2))
+    options = StepOptions(
+        refinement=Refinement(points=2, trials=3, camera_rounds=2, pattern_moves=2)
+    )
     found = play(KIND, bank, make_policy(f"constant:{damping}"), options, 4)
     layout = class_layout(KIND, options)
-    iterate = jax.jit(lambda own, state, turn: lm_step(own, state, jnp.asarray(damping), options, 0.0, turn))
+    iterate = jax.jit(
+        lambda own, state, turn: lm_step(own, state, jnp.asarray(damping), options, 0.0, turn)
+    )
     repairs = 0
     for k in range(6):
         own = with_scene(layout, bank.scenes.pixels[k], bank.scenes.mask[k])
@@ -152,16 +177,20 @@ def test_lanes_do_not_mix_scenes(monkeypatch):
     order = np.random.default_rng(0).permutation(len(bank.initial_cost))
     monkeypatch.setattr(module, "LANES", 8)
     assert len(order) > 8
-    mixed = play(KIND, select(bank, order), CERES, StepOptions(), LIMIT - 1)  # another limit: a program of its own
+    # another limit: a program of its own
+    mixed = play(KIND, select(bank, order), CERES, StepOptions(), LIMIT - 1)
     straight = played()
     np.testing.assert_allclose(mixed.costs, straight.costs[order][:, :-1], rtol=1e-5)
-    np.testing.assert_array_equal(np.minimum(straight.iterations[order], LIMIT - 1), mixed.iterations)
+    np.testing.assert_array_equal(
+        np.minimum(straight.iterations[order], LIMIT - 1), mixed.iterations
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["lm"])
 def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
-    """Each of its lambdas in a solve is the one it chose in the game, so its observations were the same."""
+    """Each of its lambdas in a solve is the one it chose in the game, so its observations were the
+    same."""
     options = make_method(method).options(StepOptions())
     rng = np.random.default_rng(2)
     size = observation_size(AGENT)
@@ -173,20 +202,31 @@ def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
     for k in (0, 1, 5):
         alone = solve(problem_of(KIND, bank.scenes, k), policy, options, max_iterations=limit)
         count = min(4, alone.iterations)
-        np.testing.assert_allclose(found.dampings[k, :count], alone.history.damping[:count], rtol=1e-3)
+        np.testing.assert_allclose(
+            found.dampings[k, :count], alone.history.damping[:count], rtol=1e-3
+        )
 
 
 # Scores
 
 
 def test_reaching_a_cost_is_counted_from_the_start():
-    costs = np.array([[9.0, 5.0, 1.0005, 1.0], [1.0, 1.0, 1.0, 1.0], [9.0, 8.0, 7.0, 6.0], [9.0, 1.002, 1.002, 1.0009]])
+    costs = np.array(
+        [
+            [9.0, 5.0, 1.0005, 1.0],
+            [1.0, 1.0, 1.0, 1.0],
+            [9.0, 8.0, 7.0, 6.0],
+            [9.0, 1.002, 1.002, 1.0009],
+        ]
+    )
     np.testing.assert_array_equal(reach(costs, np.ones(4), 1e-3), [2, 0, np.inf, 3])
     np.testing.assert_array_equal(reach(costs, np.full(4, 6.5), 0.0), [1, 0, 3, 1])
 
 
 def test_a_score_is_what_numpy_makes_of_the_iterations():
-    costs = np.array([[8.0, 4.0, 2.0, 1.0, 1.0], [8.0, 1.0, 1.0, 1.0, 1.0], [8.0, 7.0, 6.0, 5.0, 5.0]])
+    costs = np.array(
+        [[8.0, 4.0, 2.0, 1.0, 1.0], [8.0, 1.0, 1.0, 1.0, 1.0], [8.0, 7.0, 6.0, 5.0, 5.0]]
+    )
     run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]))
     found = score(run, np.array([4.0, 1.0, 5.0]), 1e-3, 4)
     there = np.array([1, 1, 3])
@@ -207,7 +247,9 @@ def test_a_paired_ratio_is_the_geometric_mean_with_the_interval_of_its_standard_
     mean, *interval = paired_ratio(theirs * np.exp(noise), theirs)
     np.testing.assert_allclose(mean, np.exp(noise.mean()))
     half = 1.96 * noise.std() / np.sqrt(400)
-    np.testing.assert_allclose(np.log(interval), noise.mean() + np.array([-half, half]), atol=0.2 * half)
+    np.testing.assert_allclose(
+        np.log(interval), noise.mean() + np.array([-half, half]), atol=0.2 * half
+    )
 
 
 @pytest.mark.slow
@@ -215,7 +257,8 @@ def test_the_best_constant_action_has_the_fewest_iterations():
     bank = tiny_bank()
     best = best_constant_action(KIND, bank, GameConfig(AGENT, max_iterations=LIMIT), StepOptions())
     means = [
-        evaluate(KIND, bank, always(action, AGENT), StepOptions(), 1e-3, LIMIT).mean for action in CONSTANT_ACTIONS
+        evaluate(KIND, bank, always(action, AGENT), StepOptions(), 1e-3, LIMIT).mean
+        for action in CONSTANT_ACTIONS
     ]
     assert means[CONSTANT_ACTIONS.index(best)] == min(means) < max(means)
 
@@ -240,16 +283,28 @@ def test_an_evaluation_is_the_score_of_playing():
 
 def test_the_virtual_best_is_no_worse_than_any_of_its_members_on_any_scene():
     bank = tiny_bank()
-    policies = {name: (make_policy(name), StepOptions()) for name in ("ceres", "ceres:10", "ceres:1e-9")}
+    policies = {
+        name: (make_policy(name), StepOptions()) for name in ("ceres", "ceres:10", "ceres:1e-9")
+    }
     found = scores({}, play_all(KIND, bank, policies, LIMIT), bank, 1e-3, LIMIT)
     assert list(found) == [*policies, "virtual best"]
     best = found["virtual best"]
     for name in policies:
-        for field in ("mean", "geometric_mean", "median", "p90", "failures", "to_convergence", "end"):
+        for field in (
+            "mean",
+            "geometric_mean",
+            "median",
+            "p90",
+            "failures",
+            "to_convergence",
+            "end",
+        ):
             assert getattr(best, field) <= getattr(found[name], field) + 1e-12, (name, field)
     assert best.mean < min(found[name].mean for name in policies)
     # and no better than the best of each scene
     runs = [play(KIND, bank, policy, StepOptions(), LIMIT) for policy, _ in policies.values()]
     known = np.min([np.asarray(bank.best_cost), *(run.costs[:, -1] for run in runs)], axis=0)
-    soonest = np.min([np.minimum(np.maximum(reach(run.costs, known, 1e-3), 1), LIMIT) for run in runs], axis=0)
+    soonest = np.min(
+        [np.minimum(np.maximum(reach(run.costs, known, 1e-3), 1), LIMIT) for run in runs], axis=0
+    )
     np.testing.assert_allclose(best.mean, soonest.mean())

@@ -35,7 +35,9 @@ def file(tmp_path_factory) -> str:
 def test_two_cameras_have_as_many_points_in_common_as_counted_one_by_one():
     problem = street()
     seen = [set(problem.point_index[problem.camera_index == k].tolist()) for k in range(6)]
-    np.testing.assert_array_equal(covisible(problem)[:6, :6], [[len(one & other) for other in seen] for one in seen])
+    np.testing.assert_array_equal(
+        covisible(problem)[:6, :6], [[len(one & other) for other in seen] for one in seen]
+    )
 
 
 def test_cameras_of_training_and_held_out_windows_are_disjoint_and_all():
@@ -45,7 +47,8 @@ def test_cameras_of_training_and_held_out_windows_are_disjoint_and_all():
 
 
 def test_a_window_holds_what_the_problem_holds(file):
-    """Cameras, points and pixels are the problem's and belong together; of about half of them the starts, too."""
+    """Cameras, points and pixels are the problem's and belong together; of about half of them the
+    starts, too."""
     problem, unmoved = street(), 0
     train, held_out = read_windows([file], KIND, 20, seed=0)
     assert (len(train.mask), len(held_out.mask)) == (16, 4)
@@ -54,21 +57,35 @@ def test_a_window_holds_what_the_problem_holds(file):
     for k in range(16):
         one = problem_of(KIND, train, k)
         views = np.array([view_of[tuple(x)] for x in one.observations.tolist()])
-        for own, theirs in ((one.camera_index, problem.camera_index), (one.point_index, problem.point_index)):
+        for own, theirs in (
+            (one.camera_index, problem.camera_index),
+            (one.point_index, problem.point_index),
+        ):
             pairs = {(int(a), int(b)) for a, b in zip(own, np.asarray(theirs)[views], strict=True)}
             assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
         assert np.bincount(one.camera_index).max() <= KIND.points
         np.testing.assert_allclose(costs[k], geometry.cost(one), rtol=1e-9)
-        same = np.array_equal(one.cameras[one.camera_index], problem.cameras[problem.camera_index[views]])
-        assert same == np.array_equal(one.points[one.point_index], problem.points[problem.point_index[views]])
+        same = np.array_equal(
+            one.cameras[one.camera_index], problem.cameras[problem.camera_index[views]]
+        )
+        assert same == np.array_equal(
+            one.points[one.point_index], problem.points[problem.point_index[views]]
+        )
         unmoved += same
     assert 3 <= unmoved <= 13
 
 
 def test_held_out_windows_have_other_cameras(file):
-    camera_of = {tuple(x): int(k) for x, k in zip(street().observations.tolist(), street().camera_index, strict=True)}
+    camera_of = {
+        tuple(x): int(k)
+        for x, k in zip(street().observations.tolist(), street().camera_index, strict=True)
+    }
     used = [
-        {camera_of[tuple(x)] for k in range(len(part.mask)) for x in problem_of(KIND, part, k).observations.tolist()}
+        {
+            camera_of[tuple(x)]
+            for k in range(len(part.mask))
+            for x in problem_of(KIND, part, k).observations.tolist()
+        }
         for part in read_windows([file], KIND, 40, seed=1)
     ]
     assert all(used)
@@ -77,7 +94,9 @@ def test_held_out_windows_have_other_cameras(file):
 
 def test_the_same_seed_gives_the_same_window():
     linked, allowed = covisible(street()), np.arange(20)
-    one, same, other = (window(street(), KIND, linked, allowed, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    one, same, other = (
+        window(street(), KIND, linked, allowed, np.random.default_rng(seed)) for seed in (0, 0, 1)
+    )
     assert all(np.array_equal(a, b) for a, b in zip(one, same, strict=True))
     assert not np.array_equal(one.pixels, other.pixels)
 
@@ -86,7 +105,12 @@ def test_the_same_seed_gives_the_same_window():
     ("make", "message"),
     [
         (lambda: random_scene(scene_like("paper"), 0), "no problem has 20 cameras"),
-        (lambda: street().replace(whitening=np.tile(np.eye(2), (street().num_observations, 1, 1))), "covariances"),
+        (
+            lambda: street().replace(
+                whitening=np.tile(np.eye(2), (street().num_observations, 1, 1))
+            ),
+            "covariances",
+        ),
     ],
     ids=["small", "whitened"],
 )

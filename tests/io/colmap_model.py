@@ -1,4 +1,5 @@
-"""A small COLMAP model as lines of text, written by hand here and not by the package, so that tests can damage it."""
+"""A small COLMAP model as lines of text, written by hand here and not by the package, so that tests
+can damage it."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ FIRST_POINT = 11  # ids of points count from here, those of images from 1, and o
 
 
 class TextModel:
-    """Lines of the files, without their ends. One SIMPLE_RADIAL camera, six images, forty points."""
+    """Lines of the files, without their ends. One SIMPLE_RADIAL camera, six images, forty
+    points."""
 
     def __init__(self) -> None:
         scene = support.tiny()
@@ -28,17 +30,34 @@ class TextModel:
         self.scene = scene.replace(cameras=cameras)
         pixels = geometry.project(self.scene) * [1, -1] + LENS[1:3]
         flip = np.diag([1.0, -1.0, -1.0])
-        quaternions = Rotation.from_matrix(flip @ geometry.rotation_matrices(cameras[:, :3])).as_quat()[:, [3, 0, 1, 2]]
+        quaternions = Rotation.from_matrix(
+            flip @ geometry.rotation_matrices(cameras[:, :3])
+        ).as_quat()[:, [3, 0, 1, 2]]
         keys = [np.flatnonzero(scene.camera_index == image) for image in range(6)]
-        place = {int(view): (image + 1, k) for image, of in enumerate(keys) for k, view in enumerate(of)}
+        place = {
+            int(view): (image + 1, k) for image, of in enumerate(keys) for k, view in enumerate(of)
+        }
         self.cameras = ["# cameras", "7 SIMPLE_RADIAL 1280 960 " + " ".join(map(str, LENS))]
         self.heads = [
-            " ".join(map(str, [image + 1, *quaternions[image].tolist(), *(flip @ cameras[image, 3:6]).tolist(), 7]))
+            " ".join(
+                map(
+                    str,
+                    [
+                        image + 1,
+                        *quaternions[image].tolist(),
+                        *(flip @ cameras[image, 3:6]).tolist(),
+                        7,
+                    ],
+                )
+            )
             + f" view{image}.jpg"
             for image in range(6)
         ]
         self.keys = [
-            [[*map(str, pixels[view].tolist()), str(scene.point_index[view] + FIRST_POINT)] for view in of]
+            [
+                [*map(str, pixels[view].tolist()), str(scene.point_index[view] + FIRST_POINT)]
+                for view in of
+            ]
             for of in keys
         ]
         self.points = []
@@ -68,10 +87,14 @@ class TextModel:
         images, points = [], []
         for head, keys in zip(self.heads, self.keys, strict=True):
             identity, *pose, camera, name = head.split(None, 9)
-            seen = [struct.pack("<ddQ", float(x), float(y), int(point) % 2**64) for x, y, point in keys]
+            seen = [
+                struct.pack("<ddQ", float(x), float(y), int(point) % 2**64) for x, y, point in keys
+            ]
             pose = struct.pack("<7d", *map(float, pose))
             start = struct.pack("<I", int(identity)) + pose + struct.pack("<I", int(camera))
-            images.append(start + name.encode() + b"\0" + struct.pack("<Q", len(seen)) + b"".join(seen))
+            images.append(
+                start + name.encode() + b"\0" + struct.pack("<Q", len(seen)) + b"".join(seen)
+            )
         for (
             identity,
             x,
@@ -80,14 +103,18 @@ class TextModel:
             *rgb,
             error,
         ) in (point[:8] for point in self.points):
-            head = struct.pack("<Q3d3Bd", int(identity), float(x), float(y), float(z), *map(int, rgb), float(error))
+            head = struct.pack(
+                "<Q3d3Bd", int(identity), float(x), float(y), float(z), *map(int, rgb), float(error)
+            )
             points.append(head)
         for number, point in enumerate(self.points):
             track = list(map(int, point[8:]))
             points[number] += struct.pack(f"<Q{len(track)}I", len(track) // 2, *track)
         camera = struct.pack("<IiQQ4d", 7, 2, 1280, 960, *LENS)
         for part, records in (("cameras", [camera]), ("images", images), ("points3D", points)):
-            (folder / f"{part}.bin").write_bytes(struct.pack("<Q", len(records)) + b"".join(records))
+            (folder / f"{part}.bin").write_bytes(
+                struct.pack("<Q", len(records)) + b"".join(records)
+            )
         return folder
 
 

@@ -1,4 +1,5 @@
-"""A small scene as other programs write it, with projections by each program's published formula, in NumPy alone."""
+"""A small scene as other programs write it, with projections by each program's published formula,
+in NumPy alone."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ SIZE = (1600, 1200)
 
 @dataclass(frozen=True)
 class Lens:
-    """Brown's or the fisheye's model in pixels; x to the right, y down, from the corner of the image."""
+    """Brown's or the fisheye's model in pixels; x to the right, y down, from the corner of the
+    image."""
 
     fx: float = 1200.0
     fy: float = 1200.0
@@ -59,7 +61,9 @@ class Scene:
     def __post_init__(self) -> None:
         random = np.random.default_rng(self.seed)
         count = len(self.lens_of)
-        self.rotations = Rotation.from_rotvec(random.normal(scale=0.15, size=(count, 3))).as_matrix()
+        self.rotations = Rotation.from_rotvec(
+            random.normal(scale=0.15, size=(count, 3))
+        ).as_matrix()
         self.centers = random.uniform(-1.5, 1.5, (count, 3))
         self.points = random.uniform([-3, -2, 6], [3, 2, 12], (30, 3))
         self.seen = [(i, j) for j in range(30) for i in range(count) if random.uniform() < 0.8]
@@ -72,7 +76,8 @@ class Scene:
 
     @property
     def cost(self) -> float:
-        """Half the sum of the squared distances of observations from projections, pixels squared."""
+        """Half the sum of the squared distances of observations from projections, pixels
+        squared."""
         return 0.5 * float(np.sum((self.pixels - self.predicted) ** 2))
 
 
@@ -94,16 +99,30 @@ def write_opensfm(folder: Path, scene: Scene, models: list[str], version: int = 
         cameras[f"v2 maker {at}"] = camera
     shots = {}
     for i, rotation in enumerate(scene.rotations):
-        turn, shift = Rotation.from_matrix(rotation).as_rotvec().tolist(), (-rotation @ scene.centers[i]).tolist()
-        shots[f"a shot {i}.jpg"] = {"camera": f"v2 maker {scene.lens_of[i]}", "rotation": turn, "translation": shift}
-    points = {str(100 + j): {"coordinates": p.tolist(), "color": [1, 2, 3]} for j, p in enumerate(scene.points)}
+        turn, shift = (
+            Rotation.from_matrix(rotation).as_rotvec().tolist(),
+            (-rotation @ scene.centers[i]).tolist(),
+        )
+        shots[f"a shot {i}.jpg"] = {
+            "camera": f"v2 maker {scene.lens_of[i]}",
+            "rotation": turn,
+            "translation": shift,
+        }
+    points = {
+        str(100 + j): {"coordinates": p.tolist(), "color": [1, 2, 3]}
+        for j, p in enumerate(scene.points)
+    }
     path = folder / "reconstruction.json"
     path.write_text(json.dumps([{"cameras": cameras, "shots": shots, "points": points}]))
     lines = [] if version == 0 else [f"OPENSFM_TRACKS_VERSION_v{version}"]
     middle, end = {0: ([], []), 1: (["0.004"], []), 2: (["0.004"], ["-1", "-1"])}[version]
     for at, ((i, j), (x, y)) in enumerate(zip(scene.seen, scene.pixels.tolist(), strict=True)):
         spot = [repr((x - width / 2) / side), repr((y - height / 2) / side)]
-        lines.append("\t".join([f"a shot {i}.jpg", str(100 + j), str(at), *spot, *middle, "1", "2", "3", *end]))
+        lines.append(
+            "\t".join(
+                [f"a shot {i}.jpg", str(100 + j), str(at), *spot, *middle, "1", "2", "3", *end]
+            )
+        )
     lines.append(lines[-1].replace("a shot", "another shot"))
     (folder / "tracks.csv").write_text("\n".join(lines) + "\n")
     return path

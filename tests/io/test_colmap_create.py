@@ -11,7 +11,15 @@ import pytest
 import support
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, Lenses, ProblemError, read_problem, write_bal, write_colmap, write_problem
+from jaxba import (
+    BundleProblem,
+    Lenses,
+    ProblemError,
+    read_problem,
+    write_bal,
+    write_colmap,
+    write_problem,
+)
 from jaxba.cli.solve import run
 from jaxba.problem import geometry
 
@@ -21,7 +29,14 @@ def same_problem(one: BundleProblem, other: BundleProblem) -> None:
     np.testing.assert_allclose(one.cameras, other.cameras, rtol=1e-12, atol=1e-13)
     assert np.array_equal(one.points, other.points)
     views = [
-        sorted(zip(p.camera_index.tolist(), p.point_index.tolist(), *p.observations.T.tolist(), strict=True))
+        sorted(
+            zip(
+                p.camera_index.tolist(),
+                p.point_index.tolist(),
+                *p.observations.T.tolist(),
+                strict=True,
+            )
+        )
         for p in (one, other)
     ]
     np.testing.assert_allclose(views[0], views[1], rtol=1e-12, atol=1e-10)
@@ -40,8 +55,12 @@ def test_cameras_say_what_a_lens_has_and_which_images_share_it(tmp_path):
     problem = support.tiny()
     cameras = problem.cameras.copy()
     lens = np.array([2, 0, 2, 1, 1, 3])
-    cameras[:, 6:] = np.array([[500.0, 0.1, 0.01], [600, 0.2, 0], [700, 0, 0], [800, 0, 0.03]])[lens]
-    free = np.array([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
+    cameras[:, 6:] = np.array([[500.0, 0.1, 0.01], [600, 0.2, 0], [700, 0, 0], [800, 0, 0.03]])[
+        lens
+    ]
+    free = np.array(
+        [[True, True, True], [True, True, False], [True, False, False], [False, False, False]]
+    )
     shared = problem.replace(cameras=cameras, lenses=Lenses(lens, free))
     write_problem(shared, f"{tmp_path}/new/")
     data = (tmp_path / "new" / "cameras.bin").read_bytes()
@@ -83,8 +102,14 @@ def test_colmap_reads_the_model_with_the_same_cost_and_our_names(tmp_path):
     problem = support.tiny()
     write_colmap(problem, tmp_path / "new")
     model = pycolmap.Reconstruction(str(tmp_path / "new"))
-    assert (model.num_reg_images(), model.num_points3D(), model.compute_num_observations()) == (6, 40, 200)
-    assert sorted(image.name for image in model.images.values()) == [f"image{number:04d}.jpg" for number in range(1, 7)]
+    assert (model.num_reg_images(), model.num_points3D(), model.compute_num_observations()) == (
+        6,
+        40,
+        200,
+    )
+    assert sorted(image.name for image in model.images.values()) == [
+        f"image{number:04d}.jpg" for number in range(1, 7)
+    ]
     total = 0.0
     for point in model.points3D.values():
         errors = [
@@ -118,8 +143,14 @@ def test_cameras_and_points_that_nothing_sees_are_written_too(tmp_path):
 
 
 REFUSED = {
-    "focal length": ({"cameras": (2, 6, 0.0)}, "f of camera 2 is 0, and COLMAP's focal lengths are positive"),
-    "far pixel": ({"observations": (5, 0, 1e12)}, r"a pixel is 1e\+12 from the centre of its image"),
+    "focal length": (
+        {"cameras": (2, 6, 0.0)},
+        "f of camera 2 is 0, and COLMAP's focal lengths are positive",
+    ),
+    "far pixel": (
+        {"observations": (5, 0, 1e12)},
+        r"a pixel is 1e\+12 from the centre of its image",
+    ),
     "no number": ({"points": (4, 1, np.nan)}, r"points\[4\] is not finite"),
 }
 
@@ -138,12 +169,15 @@ def test_what_a_model_cannot_hold_is_refused_and_nothing_written(tmp_path, what)
 def test_only_an_empty_folder_or_one_of_a_model_is_written(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes").write_text("mine")
-    with pytest.raises(ProblemError, match="mine: the directory holds other files, and no COLMAP model"):
+    with pytest.raises(
+        ProblemError, match="mine: the directory holds other files, and no COLMAP model"
+    ):
         write_problem(support.tiny(), tmp_path / "mine")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes"]
     for _ in range(2):
         (tmp_path / "empty").mkdir(exist_ok=True)
-        for hidden in (".DS_Store", "._cameras.bin", "._images.txt"):  # systems leave such files in any folder
+        # systems leave such files in any folder
+        for hidden in (".DS_Store", "._cameras.bin", "._images.txt"):
             (tmp_path / "empty" / hidden).write_text("hidden")
         write_problem(support.tiny(), tmp_path / "empty")
         same_problem(read_problem(tmp_path / "empty"), support.tiny())
@@ -155,7 +189,10 @@ def test_the_command_writes_the_solution_of_a_bal_file_into_a_folder(tmp_path, c
     assert run([str(file), "--output", str(tmp_path / "new") + "/"]) == 0
     printed = capsys.readouterr()
     assert (
-        printed.out.count("note: names and sizes of images, and so principal points, are made up in that model\n") == 1
+        printed.out.count(
+            "note: names and sizes of images, and so principal points, are made up in that model\n"
+        )
+        == 1
     )
     assert f"wrote {tmp_path}/new/\n" in printed.out
     assert printed.err == ""
@@ -163,7 +200,8 @@ def test_the_command_writes_the_solution_of_a_bal_file_into_a_folder(tmp_path, c
 
 
 def rolled(problem: BundleProblem, cameras: list[int]) -> BundleProblem:
-    """The problem with some cameras rolled by 180 degrees, and their focal lengths negative: the same pixels."""
+    """The problem with some cameras rolled by 180 degrees, and their focal lengths negative: the
+    same pixels."""
     numbers = np.array(problem.cameras)
     turn = Rotation.from_euler("z", 180, degrees=True)
     numbers[cameras, :3] = (turn * Rotation.from_rotvec(numbers[cameras, :3])).as_rotvec()
@@ -180,10 +218,14 @@ def test_cameras_of_a_negative_focal_length_are_written_as_rolled_ones(tmp_path,
     if target == "new/":
         same_problem(read_problem(tmp_path / "new"), problem)
     else:
-        found, same = (json.loads((tmp_path / name).read_text()) for name in (target, f"same{target}"))
+        found, same = (
+            json.loads((tmp_path / name).read_text()) for name in (target, f"same{target}")
+        )
         for one, other in zip(found["frames"], same["frames"], strict=True):
             assert one["fl_x"] == other["fl_x"] > 0
-            np.testing.assert_allclose(one["transform_matrix"], other["transform_matrix"], atol=1e-13)
+            np.testing.assert_allclose(
+                one["transform_matrix"], other["transform_matrix"], atol=1e-13
+            )
 
 
 def test_a_model_whose_focal_length_became_negative_is_written_into_itself(tmp_path):
@@ -196,7 +238,18 @@ def test_a_model_whose_focal_length_became_negative_is_written_into_itself(tmp_p
 
 def test_a_solve_of_cameras_with_negative_focal_lengths_writes_its_model(tmp_path, capsys):
     write_bal(rolled(support.tiny(), [0, 3]), tmp_path / "rolled.txt")
-    assert run([str(tmp_path / "rolled.txt"), "--max-iterations", "1", "--output", f"{tmp_path}/model/"]) == 0
+    assert (
+        run(
+            [
+                str(tmp_path / "rolled.txt"),
+                "--max-iterations",
+                "1",
+                "--output",
+                f"{tmp_path}/model/",
+            ]
+        )
+        == 0
+    )
     assert "wrote" in capsys.readouterr().out
     assert (read_problem(tmp_path / "model").cameras[:, 6] > 0).all()
 

@@ -1,4 +1,5 @@
-"""COLMAP models with damage: that of one view, point or image is left out with a note, all else refused in one line."""
+"""COLMAP models with damage: that of one view, point or image is left out with a note, all else
+refused in one line."""
 
 from __future__ import annotations
 
@@ -10,7 +11,14 @@ import pytest
 from colmap_model import FIRST_POINT, TextModel, head_with, noted, refusal, swap
 
 from benchmarks.damage import damaged
-from jaxba import BundleProblem, ProblemError, ProblemWarning, read_colmap, read_problem, write_colmap
+from jaxba import (
+    BundleProblem,
+    ProblemError,
+    ProblemWarning,
+    read_colmap,
+    read_problem,
+    write_colmap,
+)
 from jaxba.cli.bench import run as run_bench
 from jaxba.cli.solve import run
 from jaxba.io import json_lines
@@ -54,7 +62,9 @@ def test_a_binary_file_whose_count_looks_like_the_beginning_of_a_compressed_one_
     points = int.from_bytes(b"\x1f\x8b", "little")  # gzip's first bytes
     index = np.repeat([0, 1], points), np.tile(np.arange(points), 2)
     cameras = np.tile([0.0, 0, 0, 0, 0, -5, 700, 0, 0], (2, 1))
-    problem = BundleProblem.create(cameras, np.zeros((points, 3)), np.zeros((2 * points, 2)), *index)
+    problem = BundleProblem.create(
+        cameras, np.zeros((points, 3)), np.zeros((2 * points, 2)), *index
+    )
     write_colmap(problem, tmp_path)
     assert (tmp_path / "points3D.bin").read_bytes()[:2] == b"\x1f\x8b"
     assert read_problem(tmp_path).num_points == points
@@ -91,10 +101,15 @@ def test_key_points_are_believed_where_tracks_name_others(tmp_path, healthy, dam
     if damage is key_numbers_beyond:
         count = len(model.points[7][9::2])
         image = model.points[7][8]
-        assert note.startswith(f"points3D.{'bin' if binary else 'txt'}: 1 point with another track than key-points say")
+        assert note.startswith(
+            f"points3D.{'bin' if binary else 'txt'}: 1 point with another track than key-points say"
+        )
         assert count > 1
         size = len(model.keys[int(image) - 1])
-        beyond = f"key-point {model.points[7][9]} of image {image} (view{int(image) - 1}.jpg), which has {size})"
+        beyond = (
+            f"key-point {model.points[7][9]} of image {image} (view{int(image) - 1}.jpg), "
+            f"which has {size})"
+        )
         assert note.endswith(f"(point 18: {beyond}")
     assert same(problem, healthy)
 
@@ -104,7 +119,8 @@ def test_a_view_that_names_an_absent_image_is_left_out(tmp_path, healthy):
     model.points[3] += ["99", "0", "4294967295", "4294967295", "-1", "-1"]
     problem, (note,) = noted(model.write(tmp_path / "m"))
     assert note == (
-        "points3D.txt: 3 track elements left out, of an image that images.txt does not have (point 14: key-point 0 of "
+        "points3D.txt: 3 track elements left out, of an image that images.txt does not have (point "
+        "14: key-point 0 of "
         "image 99)"
     )
     assert same(problem, healthy)
@@ -125,7 +141,8 @@ def test_key_points_say_which_views_there_are(tmp_path, healthy):
     del model.points[1][-2:]  # its key-point goes on to name point 12
     problem, notes = noted(model.write(tmp_path / "m"))
     assert notes == [
-        "points3D.txt: 2 points with another track than key-points say, where images.txt is believed (point 11: "
+        "points3D.txt: 2 points with another track than key-points say, where images.txt is "
+        "believed (point 11: "
         f"key-point {key} of image {image} (view{image - 1}.jpg))",
     ]
     lost = np.flatnonzero((healthy.camera_index == image - 1) & (healthy.point_index == 0))[0]
@@ -137,7 +154,8 @@ def test_points_that_are_missing_are_those_of_no_view(tmp_path, healthy):
     views = len(model.points.pop()[8:]) // 2
     problem, (note,) = noted(model.write(tmp_path / "m"))
     assert note.startswith(
-        f"images.txt: {views} key-points left out, of a point that points3D.txt does not have (image "
+        f"images.txt: {views} key-points left out, of a point that points3D.txt does not have "
+        "(image "
     )
     assert problem.num_points == 39
     assert np.array_equal(problem.points, healthy.points[:39])
@@ -156,7 +174,9 @@ def test_what_is_no_number_leaves_out_its_point_or_key_point(tmp_path, healthy, 
         "images.txt: 1 key-point left out, not finite (image 3 (view2.jpg): key-point 0)",
     ]
     assert np.array_equal(problem.points, np.delete(healthy.points, 5, axis=0))
-    views = np.flatnonzero((healthy.point_index == 5) | ((healthy.point_index == point) & (healthy.camera_index == 2)))
+    views = np.flatnonzero(
+        (healthy.point_index == 5) | ((healthy.point_index == point) & (healthy.camera_index == 2))
+    )
     assert np.array_equal(problem.observations, np.delete(healthy.observations, views, axis=0))
 
 
@@ -166,16 +186,23 @@ def test_an_image_without_key_points_is_left_out_and_written_again(tmp_path, hea
     blind = 5
     model.keys[blind] = []
     for point in model.points:
-        track = [pair for pair in zip(point[8::2], point[9::2], strict=True) if pair[0] != str(blind + 1)]
+        track = [
+            pair for pair in zip(point[8::2], point[9::2], strict=True) if pair[0] != str(blind + 1)
+        ]
         point[8:] = [word for pair in track for word in pair]
     folder = model.write(tmp_path / "m")
     if layout != "empty line":
         lines = (folder / "images.txt").read_text().split("\n")
         del lines[2 + 2 * blind]
         text = "\n".join(lines)
-        (folder / "images.txt").write_text(text.rstrip("\n") if layout == "no end of the last line" else text)
+        (folder / "images.txt").write_text(
+            text.rstrip("\n") if layout == "no end of the last line" else text
+        )
     problem, (note,) = noted(folder)
-    assert note == f"images.txt: 1 image left out, without observations (image {blind + 1} (view{blind}.jpg))"
+    assert (
+        note == f"images.txt: 1 image left out, without observations (image {blind + 1} "
+        f"(view{blind}.jpg))"
+    )
     assert np.array_equal(problem.cameras, np.delete(healthy.cameras, blind, axis=0))
     with pytest.raises(ProblemError, match="1 image left out, without observations"):
         read_problem(folder, strict=True)
@@ -198,7 +225,8 @@ def test_writing_in_place_keeps_what_was_left_out(tmp_path):
     moved = problem.replace(points=problem.points + 1)
     write_colmap(moved, folder, like=folder)
     lines = {
-        name: (folder / name).read_text().splitlines()[1:] for name in ("cameras.txt", "images.txt", "points3D.txt")
+        name: (folder / name).read_text().splitlines()[1:]
+        for name in ("cameras.txt", "images.txt", "points3D.txt")
     }
     assert [line.split(None, 9)[9] for line in lines["images.txt"][::2]] == [
         head.split(None, 9)[9] for head in model.heads
@@ -209,14 +237,23 @@ def test_writing_in_place_keeps_what_was_left_out(tmp_path):
         words = line.split()
         assert (words[0], words[4:7], words[8:]) == (point[0], point[4:7], point[8:])
         by = 0 if point is model.points[5] else 1
-        np.testing.assert_allclose(np.array(words[1:4], float), np.array(point[1:4], float) + by, rtol=1e-14)
+        np.testing.assert_allclose(
+            np.array(words[1:4], float), np.array(point[1:4], float) + by, rtol=1e-14
+        )
     assert lines["points3D.txt"][5].split()[7] == "0.5"  # its error is as it was
     again, after = noted(folder)
     assert [note.partition("(")[0] for note in after] == [note.partition("(")[0] for note in notes]
     assert np.array_equal(again.points, moved.points)
 
 
-NAMES = ["a b.jpg", "flight A, plan  (2) 1.jpg", '"it\'s".jpg', "\u00e9\u6771 \u00df.jpg", "# 5.jpg", "sub dir/6.JPG"]
+NAMES = [
+    "a b.jpg",
+    "flight A, plan  (2) 1.jpg",
+    '"it\'s".jpg',
+    "\u00e9\u6771 \u00df.jpg",
+    "# 5.jpg",
+    "sub dir/6.JPG",
+]
 
 
 @pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
@@ -240,9 +277,13 @@ def test_marks_line_ends_blanks_and_comments_do_not_matter(tmp_path, healthy):
     layouts = {
         "windows": lambda lines: "\r\n".join([*lines, ""]).encode("utf-8-sig"),
         "16 bits": lambda lines: "\r\n".join([*lines, ""]).encode("utf-16"),
-        "blanks": lambda lines: "".join(f"  {line.replace(' ', '  ')} \t\n" for line in lines).encode(),
+        "blanks": lambda lines: "".join(
+            f"  {line.replace(' ', '  ')} \t\n" for line in lines
+        ).encode(),
         "no end": lambda lines: "\n".join(lines).encode(),
-        "comments": lambda lines: "".join(f"# {n}\n{line}\n# x y z\n" for n, line in enumerate(lines)).encode(),
+        "comments": lambda lines: "".join(
+            f"# {n}\n{line}\n# x y z\n" for n, line in enumerate(lines)
+        ).encode(),
     }
     for layout, text in layouts.items():
         (tmp_path / layout).mkdir()
@@ -278,7 +319,9 @@ def test_ids_of_points_are_exact_up_to_the_largest(tmp_path, healthy):
 # Rigs and frames
 
 
-def framed(folder: Path, images: list[int], rigs: str = "7 1 CAMERA 7", data: str = "1 CAMERA 7 {}") -> Path:
+def framed(
+    folder: Path, images: list[int], rigs: str = "7 1 CAMERA 7", data: str = "1 CAMERA 7 {}"
+) -> Path:
     model = TextModel()
     model.write(folder)
     (folder / "rigs.txt").write_text(f"# rigs\n{rigs}\n")
@@ -294,7 +337,8 @@ def test_poses_of_frames_count_and_images_without_one_stay_as_they_are(tmp_path,
     problem, notes = noted(folder)
     assert notes == [
         "images.txt: 1 image left out, without a frame (image 5 (view4.jpg))",
-        "images.txt: 1 image with another pose than in frames.txt, which counts (image 4 (view3.jpg))",
+        "images.txt: 1 image with another pose than in frames.txt, which counts (image 4 "
+        "(view3.jpg))",
     ]
     assert np.array_equal(problem.cameras, np.delete(healthy.cameras, 4, axis=0))
     moved = problem.replace(cameras=problem.cameras + np.array([0, 0, 0, 1, 0, 0, 0, 0, 0]))
@@ -314,11 +358,23 @@ def test_sensors_that_are_no_cameras_are_left_out_and_counted(tmp_path, healthy)
 
 RIGS = {
     "absent rig": (("8 1 CAMERA 7", "1 CAMERA 7 {}"), "frames.txt: frame 101: rig 7 is not in "),
-    "absent sensor": (("7 1 IMU 7", "1 CAMERA 7 {}"), "frames.txt: frame 101: rig 7 has no sensor 7 of datum 1"),
+    "absent sensor": (
+        ("7 1 IMU 7", "1 CAMERA 7 {}"),
+        "frames.txt: frame 101: rig 7 has no sensor 7 of datum 1",
+    ),
     "absent camera": (("7 1 CAMERA 8", "1 CAMERA 7 {}"), "rigs.txt: rig 7: camera 8 is not in "),
-    "word of no sensor": (("7 1 LIDAR 7", "1 CAMERA 7 {}"), "rigs.txt line 2: rig 7: 'LIDAR' is no type of sensors"),
-    "image in two frames": (("7 1 CAMERA 7", "1 CAMERA 7 3"), "frames.txt: image 3 is in two frames"),
-    "count too large": (("7 9 CAMERA 7", "1 CAMERA 7 {}"), "rigs.txt line 2: rig 7: '9' is outside 0..3"),
+    "word of no sensor": (
+        ("7 1 LIDAR 7", "1 CAMERA 7 {}"),
+        "rigs.txt line 2: rig 7: 'LIDAR' is no type of sensors",
+    ),
+    "image in two frames": (
+        ("7 1 CAMERA 7", "1 CAMERA 7 3"),
+        "frames.txt: image 3 is in two frames",
+    ),
+    "count too large": (
+        ("7 9 CAMERA 7", "1 CAMERA 7 {}"),
+        "rigs.txt line 2: rig 7: '9' is outside 0..3",
+    ),
     "left over": (("7 1 CAMERA 7 1", "1 CAMERA 7 {}"), "rigs.txt line 2: rig 7: '1' is left over"),
 }
 
@@ -334,7 +390,9 @@ def test_a_frame_without_a_finite_pose_is_refused_by_its_image(tmp_path):
     lines = (folder / "frames.txt").read_text().split("\n")
     lines[4] = " ".join([*lines[4].split()[:2], "nan", *lines[4].split()[3:]])
     (folder / "frames.txt").write_text("\n".join(lines))
-    assert refusal(folder).startswith("frames.txt: frame 104 of image 4 (view3.jpg): qvec is not finite: nan ")
+    assert refusal(folder).startswith(
+        "frames.txt: frame 104 of image 4 (view3.jpg): qvec is not finite: nan "
+    )
 
 
 # Commands
@@ -344,7 +402,11 @@ def test_the_command_says_what_was_left_out_and_strict_refuses(tmp_path, capsys)
     model = TextModel()
     model.points[3] += ["99", "0"]
     folder = model.write(tmp_path / "m")
-    note = f"{folder}/points3D.txt: 1 track element left out, of an image that {folder}/images.txt does not have"
+    note = (
+        f"{folder}/points3D.txt: 1 track element left out, of an image that "
+        f"{folder}/images.txt "
+        "does not have"
+    )
     assert run([str(folder), "--max-iterations", "1", "--output", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith(f"note: {note} (")
@@ -361,7 +423,11 @@ def test_a_principal_point_at_the_edge_is_mentioned_and_not_refused(tmp_path):
     folder = TextModel().write(tmp_path / "m")
     swap("cameras.txt", "640.0 480.0", "0.0 0.0")(folder)
     _, (note,) = noted(folder)
-    assert note == "cameras.txt: 1 principal point at the edge of the image (camera 7: pixel 0, 0 of 1280 x 960)"
+    assert (
+        note
+        == "cameras.txt: 1 principal point at the edge of the image (camera 7: pixel 0, 0 of 1280 "
+        "x 960)"
+    )
     with pytest.warns(ProblemWarning, match="principal point"):
         read_colmap(folder, strict=True)
 
@@ -371,20 +437,37 @@ def test_a_benchmark_goes_on_after_models_that_cannot_be_read(tmp_path, capsys):
     bad, odd, good = (TextModel().write(tmp_path / name) for name in ("bad", "odd", "good"))
     head_with(1, "nan")(bad)
     (odd / "images.txt").write_text((odd / "images.txt").read_text() + "9 1 0 0 0 0 0 0 7 last.jpg")
-    arguments = [*map(str, (bad, odd, good)), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "2"]
+    arguments = [
+        *map(str, (bad, odd, good)),
+        "--solvers",
+        "ceres",
+        "--repeats",
+        "1",
+        "--max-iterations",
+        "2",
+    ]
     assert run_bench([*arguments, "--out", str(tmp_path / "runs")]) == 2
     printed = capsys.readouterr()
-    assert printed.err.startswith(f"error: {bad}/images.txt: image 4 (view3.jpg): qvec is not finite: ")
+    assert printed.err.startswith(
+        f"error: {bad}/images.txt: image 4 (view3.jpg): qvec is not finite: "
+    )
     assert printed.err.count("\n") == 1
-    assert f"note: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n" in printed.out
-    assert [record.problem for record in json_lines.read(tmp_path / "runs" / "results.jsonl", Record)] == [
+    assert (
+        f"note: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n"
+        in printed.out
+    )
+    assert [
+        record.problem for record in json_lines.read(tmp_path / "runs" / "results.jsonl", Record)
+    ] == [
         "odd",
         "good",
     ]
     (good / "._cameras.txt").write_text("of a Mac")  # the model is still the same
     assert run_bench([str(good), *arguments[3:], "--out", str(tmp_path / "runs")]) == 0
     assert run_bench([str(odd), "--strict", *arguments[3:], "--out", str(tmp_path / "strict")]) == 2
-    error = f"error: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n"
+    error = (
+        f"error: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n"
+    )
     assert capsys.readouterr().err == error
 
 

@@ -1,4 +1,5 @@
-"""Files of COLMAP models: what is read is what COLMAP reads, and what is written COLMAP reads with the same numbers."""
+"""Files of COLMAP models: what is read is what COLMAP reads, and what is written COLMAP reads with
+the same numbers."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 def synthetic(kind: str = "SIMPLE_RADIAL", **options):
-    """A reconstruction that COLMAP makes up; ids of points have a gap, and one key-point in five is of none."""
+    """A reconstruction that COLMAP makes up; ids of points have a gap, and one key-point in five is
+    of none."""
     settings = pycolmap.SyntheticDatasetOptions()
     for name, value in {
         "num_rigs": 2,
@@ -59,7 +61,11 @@ def same_numbers(model: Model, truth) -> None:
     assert sorted(model.cameras) == sorted(truth.cameras)
     for identity, camera in model.cameras.items():
         other = truth.camera(identity)
-        assert (camera.model, camera.width, camera.height) == (other.model.name, other.width, other.height)
+        assert (camera.model, camera.width, camera.height) == (
+            other.model.name,
+            other.width,
+            other.height,
+        )
         assert list(camera.params) == other.params.tolist()
     assert sorted(model.images) == sorted(truth.images)
     for identity, image in model.images.items():
@@ -70,7 +76,9 @@ def same_numbers(model: Model, truth) -> None:
         assert list(image.pose[4:]) == pose.translation.tolist()
         keys = other.points2D
         assert image.keys["xy"].tolist() == [key.xy.tolist() for key in keys]
-        assert image.keys["point"].tolist() == [key.point3D_id if key.has_point3D() else NO_POINT for key in keys]
+        assert image.keys["point"].tolist() == [
+            key.point3D_id if key.has_point3D() else NO_POINT for key in keys
+        ]
     ends = np.cumsum(model.points["length"].astype(int))
     assert sorted(model.points["id"].tolist()) == sorted(truth.point3D_ids())
     for head, track in zip(model.points, np.split(model.tracks, ends[:-1]), strict=True):
@@ -78,7 +86,9 @@ def same_numbers(model: Model, truth) -> None:
         assert head["xyz"].tolist() == other.xyz.tolist()
         assert head["rgb"].tolist() == other.color.tolist()
         assert head["error"] == other.error
-        assert track.tolist() == [(view.image_id, view.point2D_idx) for view in other.track.elements]
+        assert track.tolist() == [
+            (view.image_id, view.point2D_idx) for view in other.track.elements
+        ]
     if model.rigs is not None and model.frames is not None:
         assert sorted(model.rigs) == sorted(truth.rigs)
         assert sorted(model.frames) == sorted(truth.frames)
@@ -86,7 +96,9 @@ def same_numbers(model: Model, truth) -> None:
             other = truth.frame(identity)
             assert frame.rig == other.rig_id
             assert list(frame.pose[4:]) == other.rig_from_world.translation.tolist()
-            assert sorted(image for _, image in frame.images) == sorted(one.id for one in other.image_ids)
+            assert sorted(image for _, image in frame.images) == sorted(
+                one.id for one in other.image_ids
+            )
 
 
 @pytest.mark.parametrize("layout", ["binary", "text", "old binary", "old text"])
@@ -111,7 +123,10 @@ def test_camera_models_are_colmaps(kind):
 
 def test_all_camera_models_and_sensors_of_colmap_are_known():
     assert set(MODELS) == set(pycolmap.CameraModelId.__members__) - {"INVALID"}
-    assert {name: int(kind) for name, kind in pycolmap.SensorType.__members__.items()} == {**SENSORS, "INVALID": -1}
+    assert {name: int(kind) for name, kind in pycolmap.SensorType.__members__.items()} == {
+        **SENSORS,
+        "INVALID": -1,
+    }
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -134,7 +149,9 @@ def test_what_is_written_colmap_reads_with_the_same_numbers(tmp_path, layout, fo
 
 
 @pytest.mark.parametrize("layout", ["binary", "text", "old binary", "old text"])
-def test_a_solution_is_written_with_a_rig_of_each_camera_and_a_frame_of_each_image(tmp_path, layout):
+def test_a_solution_is_written_with_a_rig_of_each_camera_and_a_frame_of_each_image(
+    tmp_path, layout
+):
     folder = write(synthetic(), tmp_path / "m", layout)
     problem = read_colmap(folder)
     moved = problem.replace(points=problem.points + 1.0)
@@ -164,7 +181,9 @@ def test_errors_of_points_are_colmaps_whatever_the_lens(tmp_path, kind):
     truth.update_point_3d_errors()
     stored = read_model(tmp_path / "out").points
     assert stored["error"].min() > 1e-3
-    np.testing.assert_allclose(stored["error"], [truth.point3D(int(i)).error for i in stored["id"]], rtol=1e-7)
+    np.testing.assert_allclose(
+        stored["error"], [truth.point3D(int(i)).error for i in stored["id"]], rtol=1e-7
+    )
 
 
 @needs_data

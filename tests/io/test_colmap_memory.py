@@ -21,15 +21,25 @@ pytestmark = pytest.mark.extra
 ROUNDING = 1e-14  # of quaternions, which pycolmap normalises again when it reads a file
 
 
-def scene(rigs=6, cameras=1, frames=1, points=60, model="SIMPLE_RADIAL", lens=(1280, 512, 384, 0.05)):
+def scene(
+    rigs=6, cameras=1, frames=1, points=60, model="SIMPLE_RADIAL", lens=(1280, 512, 384, 0.05)
+):
     """A scene with noise, in which some key-points see no point."""
     pycolmap.set_random_seed(2)
     options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = rigs, cameras, frames
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
+        rigs,
+        cameras,
+        frames,
+    )
     options.num_points3D, options.num_points2D_without_point3D = points, 7
     options.camera_model_id, options.camera_params = pycolmap.CameraModelId.__members__[model], lens
     reconstruction = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = 0.5, 0.02, 0.3
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
+        0.5,
+        0.02,
+        0.3,
+    )
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, reconstruction)
     return reconstruction
@@ -105,7 +115,11 @@ def chosen_of_whole(whole, config, reconstruction):
     images = labels.positions("image", sorted(config.images))
     points = labels.positions("point", sorted({*config.variable_points, *config.constant_points}))
     problem = jaxba.part(whole, images=images, points=points)
-    held = [number for number in labels.images.tolist() if is_held(reconstruction.images[number], config)]
+    held = [
+        number
+        for number in labels.images.tolist()
+        if is_held(reconstruction.images[number], config)
+    ]
     poses = labels.positions("image", held)
     if problem.rigs is not None and problem.rigs.free is not None:
         poses = poses[~problem.rigs.free[poses]]
@@ -130,12 +144,18 @@ def assert_same(problem, expected):
     ours, theirs = every_lens(problem), every_lens(expected)
     np.testing.assert_array_equal(ours.free[ours.index], theirs.free[theirs.index])
     for at in range(problem.num_cameras):
-        assert ours.model_of(int(ours.index[at])).name == theirs.model_of(int(theirs.index[at])).name
+        assert (
+            ours.model_of(int(ours.index[at])).name == theirs.model_of(int(theirs.index[at])).name
+        )
     assert (problem.rigs is None) == (expected.rigs is None)
     if expected.rigs is not None:
         for name in ("rotation", "translation", "free"):
-            np.testing.assert_array_equal(getattr(problem.rigs, name), getattr(expected.rigs, name), err_msg=name)
-        frames = [np.unique(rigs.frame, return_inverse=True)[1] for rigs in (problem.rigs, expected.rigs)]
+            np.testing.assert_array_equal(
+                getattr(problem.rigs, name), getattr(expected.rigs, name), err_msg=name
+            )
+        frames = [
+            np.unique(rigs.frame, return_inverse=True)[1] for rigs in (problem.rigs, expected.rigs)
+        ]
         np.testing.assert_array_equal(*frames)
 
 
@@ -171,7 +191,10 @@ def test_points_of_short_tracks_do_not_count(tmp_path):
         assert all(lengths[number] >= least for number in problem.labels.points.tolist())
     whole = from_files(reconstruction, tmp_path / "m")
     expected = jaxba.part(whole, min_track=least)
-    assert jaxba.from_pycolmap(reconstruction, None, options).num_observations == expected.num_observations
+    assert (
+        jaxba.from_pycolmap(reconstruction, None, options).num_observations
+        == expected.num_observations
+    )
 
 
 def numbers(reconstruction):
@@ -191,13 +214,17 @@ def numbers(reconstruction):
 def assert_same_numbers(ours, theirs, rounding=ROUNDING):
     assert ours.keys() == theirs.keys()
     for key, value in theirs.items():
-        np.testing.assert_allclose(ours[key], value, rtol=rounding, atol=10 * rounding, err_msg=str(key))
+        np.testing.assert_allclose(
+            ours[key], value, rtol=rounding, atol=10 * rounding, err_msg=str(key)
+        )
 
 
 @pytest.mark.parametrize("kind", ["lenses", "rigs", "two models", "not registered"])
 def test_all_is_updated_as_files_are(kind, tmp_path):
     reconstruction = SCENES[kind]()
-    problem = jaxba.solve(jaxba.from_pycolmap(reconstruction), options=jaxba.SolveOptions(max_iterations=2)).problem
+    problem = jaxba.solve(
+        jaxba.from_pycolmap(reconstruction), options=jaxba.SolveOptions(max_iterations=2)
+    ).problem
     jaxba.write_colmap(problem, tmp_path / "new", like=written(reconstruction, tmp_path / "old"))
     before = numbers(reconstruction)
     update(reconstruction, problem)
@@ -211,8 +238,12 @@ def test_a_part_is_updated_as_files_are_and_the_rest_stays(kind, tmp_path):
     reconstruction = SCENES[kind]()
     reconstruction.update_point_3d_errors()
     config, options = chosen(reconstruction), jaxba.SolveOptions(max_iterations=2)
-    expected, *_ = chosen_of_whole(from_files(reconstruction, tmp_path / "old"), config, reconstruction)
-    jaxba.write_colmap(jaxba.solve(expected, options=options).problem, tmp_path / "new", like=tmp_path / "old")
+    expected, *_ = chosen_of_whole(
+        from_files(reconstruction, tmp_path / "old"), config, reconstruction
+    )
+    jaxba.write_colmap(
+        jaxba.solve(expected, options=options).problem, tmp_path / "new", like=tmp_path / "old"
+    )
     before = numbers(reconstruction)
     solution = jaxba.solve(jaxba.from_pycolmap(reconstruction, config), options=options)
     solution.update(reconstruction)
@@ -249,13 +280,20 @@ def test_only_what_the_part_needs_is_read():
     model = read_part(reconstruction, [1, 2], [3])
     seers = {element.image_id for element in reconstruction.points3D[3].track.elements}
     assert set(model.images) == {1, 2} | seers
-    seen = {key.point3D_id for image in (1, 2) for key in reconstruction.images[image].points2D if key.has_point3D()}
+    seen = {
+        key.point3D_id
+        for image in (1, 2)
+        for key in reconstruction.images[image].points2D
+        if key.has_point3D()
+    }
     assert set(model.points["id"].tolist()) == seen | {3}
     for number in set(model.images) - {1, 2}:
         keys = model.images[number].keys
         at = np.flatnonzero(keys["point"] == 3)
         assert at.size == np.count_nonzero(keys["point"] < len(reconstruction.points3D) + 1) == 1
-        np.testing.assert_array_equal(keys["xy"][at[0]], reconstruction.images[number].points2D[int(at[0])].xy)
+        np.testing.assert_array_equal(
+            keys["xy"][at[0]], reconstruction.images[number].points2D[int(at[0])].xy
+        )
 
 
 def test_a_key_point_is_believed_where_a_track_says_something_else():

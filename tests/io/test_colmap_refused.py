@@ -20,16 +20,37 @@ def healthy(tmp_path_factory) -> BundleProblem:
 
 REFUSED = {
     "NaN pose": (head_with(1, "nan"), "images.txt: image 4 (view3.jpg): qvec is not finite: nan "),
-    "NaN of Windows": (head_with(6, "-nan(ind)"), "images.txt: image 4 (view3.jpg): tvec is not finite: "),
-    "overflowing pose": (head_with(7, "1e999"), "images.txt: image 4 (view3.jpg): tvec is not finite: "),
+    "NaN of Windows": (
+        head_with(6, "-nan(ind)"),
+        "images.txt: image 4 (view3.jpg): tvec is not finite: ",
+    ),
+    "overflowing pose": (
+        head_with(7, "1e999"),
+        "images.txt: image 4 (view3.jpg): tvec is not finite: ",
+    ),
     "missing camera": (head_with(8, "8"), "images.txt: image 4 (view3.jpg): camera 8 is not in "),
-    "word in a pose": (head_with(3, "1,5"), "images.txt line 8: image 4: '1,5' is not a number (qy)"),
-    "number with underscores": (head_with(5, "1_0"), "images.txt line 8: image 4: '1_0' is not a number (tx)"),
-    "id with a fraction": (head_with(0, "4.5"), "images.txt line 8: '4.5' is not an integer (IMAGE_ID)"),
-    "id below -1": (head_with(0, "-2"), "images.txt line 8: '-2' is outside 0..4294967295 (IMAGE_ID)"),
+    "word in a pose": (
+        head_with(3, "1,5"),
+        "images.txt line 8: image 4: '1,5' is not a number (qy)",
+    ),
+    "number with underscores": (
+        head_with(5, "1_0"),
+        "images.txt line 8: image 4: '1_0' is not a number (tx)",
+    ),
+    "id with a fraction": (
+        head_with(0, "4.5"),
+        "images.txt line 8: '4.5' is not an integer (IMAGE_ID)",
+    ),
+    "id below -1": (
+        head_with(0, "-2"),
+        "images.txt line 8: '-2' is outside 0..4294967295 (IMAGE_ID)",
+    ),
     "id of nothing": (head_with(0, "-1"), "images.txt: 4294967295 is the id of no image"),
     "image twice": (head_with(0, "3"), "images.txt line 8: image 3: is there twice"),
-    "cut line": (swap("images.txt", " view3.jpg", "x"), "images.txt line 8: image 4: '7x' is not a number (CAMERA_ID)"),
+    "cut line": (
+        swap("images.txt", " view3.jpg", "x"),
+        "images.txt line 8: image 4: '7x' is not a number (CAMERA_ID)",
+    ),
     "unknown model": (
         swap("cameras.txt", "SIMPLE_RADIAL", "FISHEYE_2"),
         "cameras.txt line 2: camera 7: 'FISHEYE_2' is an unknown camera model",
@@ -42,14 +63,22 @@ REFUSED = {
         swap("cameras.txt", "700.0", "-700.0"),
         "cameras.txt: camera 7 has impossible parameters: -700, 640, 480, -0.03 (SIMPLE_RADIAL)",
     ),
-    "point twice": (swap("points3D.txt", "\n12 ", "\n11 "), "points3D.txt: point 11 is there twice"),
+    "point twice": (
+        swap("points3D.txt", "\n12 ", "\n11 "),
+        "points3D.txt: point 11 is there twice",
+    ),
     "colour": (
         swap("points3D.txt", " 1 2 3 ", " 1 256 3 "),
         "points3D.txt line 2: point 11: '256' is outside 0..255 (green)",
     ),
-    "half a pair": (swap("points3D.txt", " 0.5 ", " 0.5 1 "), "points3D.txt line 2: point 11: the track has "),
+    "half a pair": (
+        swap("points3D.txt", " 0.5 ", " 0.5 1 "),
+        "points3D.txt line 2: point 11: the track has ",
+    ),
     "half a 16-bit text": (
-        lambda folder: (folder / "images.txt").write_bytes((folder / "images.txt").read_text().encode("utf-16")[:-1]),
+        lambda folder: (folder / "images.txt").write_bytes(
+            (folder / "images.txt").read_text().encode("utf-16")[:-1]
+        ),
         "images.txt: is not the text that its byte order mark announces",
     ),
     "missing file": (lambda folder: (folder / "points3D.txt").unlink(), "points3D.txt is missing"),
@@ -57,7 +86,10 @@ REFUSED = {
         lambda folder: ((folder / "images.txt").unlink(), (folder / "images.txt").mkdir()),
         "images.txt is no file",
     ),
-    "rigs without frames": (lambda folder: (folder / "rigs.txt").write_text("7 1 CAMERA 7\n"), "frames.txt is missing"),
+    "rigs without frames": (
+        lambda folder: (folder / "rigs.txt").write_text("7 1 CAMERA 7\n"),
+        "frames.txt is missing",
+    ),
 }
 
 
@@ -73,26 +105,48 @@ def test_a_quaternion_of_zeros_is_refused_and_one_of_any_other_norm_is_not(tmp_p
     for scale in (0.0, 1e-300, 1e-5, 3.0, 1e300):
         model = TextModel()
         identity, *quaternion, x, y, z, camera, name = model.heads[3].split()
-        model.heads[3] = " ".join([identity, *(str(scale * float(w)) for w in quaternion), x, y, z, camera, name])
+        model.heads[3] = " ".join(
+            [identity, *(str(scale * float(w)) for w in quaternion), x, y, z, camera, name]
+        )
         folder = model.write(tmp_path / f"{scale}")
         if scale:
-            np.testing.assert_allclose(read_colmap(folder).cameras, healthy.cameras, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(
+                read_colmap(folder).cameras, healthy.cameras, rtol=1e-12, atol=1e-13
+            )
         else:
-            assert refusal(folder) == "images.txt: image 4 (view3.jpg): qvec is zero, which is no rotation"
+            assert (
+                refusal(folder)
+                == "images.txt: image 4 (view3.jpg): qvec is zero, which is no rotation"
+            )
 
 
 NAN = 0x7FF8 << 48  # the bits of a NaN
 BINARY = {
     "no points at all": ("points3D.bin", 0, b"", "points3D.bin is empty"),
-    "half a count": ("points3D.bin", 0, b"\1\0\0", "points3D.bin is cut short in the number of points"),
-    "number of points": ("points3D.bin", 0, 2**63, f"points3D.bin is cut short: {2**63} points do not"),
+    "half a count": (
+        "points3D.bin",
+        0,
+        b"\1\0\0",
+        "points3D.bin is cut short in the number of points",
+    ),
+    "number of points": (
+        "points3D.bin",
+        0,
+        2**63,
+        f"points3D.bin is cut short: {2**63} points do not",
+    ),
     "number of images": (
         "images.bin",
         0,
         2**64 - 1,
         f"images.bin is cut short: {2**64 - 1} images do not",
     ),
-    "NaN pose": ("images.bin", 12, NAN, "images.bin: image 1 (view0.jpg): qvec is not finite: nan "),
+    "NaN pose": (
+        "images.bin",
+        12,
+        NAN,
+        "images.bin: image 1 (view0.jpg): qvec is not finite: nan ",
+    ),
     "NaN lens": ("cameras.bin", 32, NAN, "cameras.bin: camera 7 has impossible parameters: nan,"),
     "number of cameras": (
         "cameras.bin",
@@ -101,15 +155,30 @@ BINARY = {
         f"cameras.bin is cut short: {2**40} cameras do not",
     ),
     "one camera too many": ("cameras.bin", 0, 2, "cameras.bin is cut short in camera 2 of 2"),
-    "length of a track": ("points3D.bin", 51, 2**60, "points3D.bin is cut short in the track of point 11"),
+    "length of a track": (
+        "points3D.bin",
+        51,
+        2**60,
+        "points3D.bin is cut short in the track of point 11",
+    ),
     "key-points": (
         "images.bin",
         82,
         2**60,
         f"images.bin is cut short: the key-points of image 1 (view0.jpg) should have {2**60}",
     ),
-    "model": ("cameras.bin", 12, b"\x63\0\0\0", "cameras.bin: camera 7 has an unknown model, number 99"),
-    "point of no id": ("points3D.bin", 8, 2**64 - 1, f"points3D.bin: {2**64 - 1} is the id of no point"),
+    "model": (
+        "cameras.bin",
+        12,
+        b"\x63\0\0\0",
+        "cameras.bin: camera 7 has an unknown model, number 99",
+    ),
+    "point of no id": (
+        "points3D.bin",
+        8,
+        2**64 - 1,
+        f"points3D.bin: {2**64 - 1} is the id of no point",
+    ),
     "no name ends": ("images.bin", 72, b"x" * 10**4, "images.bin"),
 }
 

@@ -1,4 +1,5 @@
-"""A model without rejected observations: pycolmap reads it, and all that was not rejected is as it was."""
+"""A model without rejected observations: pycolmap reads it, and all that was not rejected is as it
+was."""
 
 from __future__ import annotations
 
@@ -26,14 +27,22 @@ def test_rejected_observations_leave_tracks_and_key_points_and_points_of_one_vie
     views = np.bincount(problem.point_index[kept], minlength=problem.num_points)
     assert sorted(new.points3D) == ids[views > 1].tolist()
     assert 0 < len(new.points3D) < len(old.points3D)
-    pairs = lambda image: {(tuple(key.xy), key.point3D_id) for key in image.points2D if key.has_point3D()}
+    pairs = lambda image: {
+        (tuple(key.xy), key.point3D_id) for key in image.points2D if key.has_point3D()
+    }
     shift = lambda number: np.array(old.cameras[old.images[number].camera_id].params[1:3])
     for at, number in enumerate(problem.labels.images.tolist()):
-        mine = np.flatnonzero(kept & (problem.camera_index == at) & (views > 1)[problem.point_index])
+        mine = np.flatnonzero(
+            kept & (problem.camera_index == at) & (views > 1)[problem.point_index]
+        )
         pixels = problem.observations[mine] * [1, -1] + shift(number)
         expected = sorted(zip(map(tuple, pixels), ids[problem.point_index[mine]], strict=True))
-        assert [point for _, point in sorted(pairs(new.images[number]))] == [int(point) for _, point in expected]
-        np.testing.assert_allclose([xy for xy, _ in sorted(pairs(new.images[number]))], [xy for xy, _ in expected])
+        assert [point for _, point in sorted(pairs(new.images[number]))] == [
+            int(point) for _, point in expected
+        ]
+        np.testing.assert_allclose(
+            [xy for xy, _ in sorted(pairs(new.images[number]))], [xy for xy, _ in expected]
+        )
         assert len(new.images[number].points2D) == len(old.images[number].points2D)
     for number, point in new.points3D.items():
         assert point.track.length() == views[ids == number][0]

@@ -1,4 +1,5 @@
-"""Decimal numbers: blocks are parsed as their words are one by one, and what is written reads back bit by bit."""
+"""Decimal numbers: blocks are parsed as their words are one by one, and what is written reads back
+bit by bit."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def written_size(request):
 
 
 def expected(text: str) -> tuple[list[float], str | None]:
-    """The numbers of a text by Python's `float`, word by word, and what is wrong with the next word."""
+    """The numbers of a text by Python's `float`, word by word, and what is wrong with the next
+    word."""
     found = []
     for word in text.split():
         if not NUMBER.fullmatch(word):
@@ -59,7 +61,12 @@ def test_every_short_word_is_a_number_or_refused_as_it_is_alone(around):
             assert_parsed(around.format("".join(letters)))
 
 
-@given(st.lists(st.tuples(FINITE, st.sampled_from(["{!r}", "{:.17e}", "{:.3E}", "{:+.20g}", "{:f}"])), min_size=1))
+@given(
+    st.lists(
+        st.tuples(FINITE, st.sampled_from(["{!r}", "{:.17e}", "{:.3E}", "{:+.20g}", "{:f}"])),
+        min_size=1,
+    )
+)
 def test_numbers_in_every_form_are_rounded_correctly(numbers):
     assert_parsed(" ".join(form.format(value) for value, form in numbers))
 
@@ -71,7 +78,8 @@ def test_words_halfway_between_two_numbers_are_rounded_to_even():
     steps = [math.ulp(value).as_integer_ratio() for value in values.tolist()]
     words = []
     for (over, under), (step_over, step_under) in zip(halves, steps, strict=True):
-        top, bottom = 2 * over * step_under + under * step_over, 2 * under * step_under  # the value and half a step
+        # the value and half a step
+        top, bottom = 2 * over * step_under + under * step_over, 2 * under * step_under
         shift = max(bottom.bit_length() - 1, 0)  # a power of two: exact with so many decimal digits
         digits = str(top * 5**shift * 2**shift // bottom).rjust(shift + 1, "0")
         words.append(f"{digits[: len(digits) - shift]}.{digits[len(digits) - shift :]}")
@@ -86,10 +94,16 @@ def test_written_numbers_read_back_bit_by_bit_in_the_fewest_digits(values):
     assert list(map(count, lines)) == [count(repr(value)) for value in values]
 
 
-@given(st.lists(st.tuples(st.integers(0, 2**31 - 2), st.integers(0, 2**31 - 2), FINITE, FINITE), min_size=1))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**31 - 2), st.integers(0, 2**31 - 2), FINITE, FINITE), min_size=1
+    )
+)
 def test_lines_of_observations_hold_two_integers_and_a_pixel(rows):
     cameras, points, x, y = map(np.array, zip(*rows, strict=True))
-    text = observation_lines(cameras.astype(np.int32), points.astype(np.int32), np.stack([x, y], axis=1))
+    text = observation_lines(
+        cameras.astype(np.int32), points.astype(np.int32), np.stack([x, y], axis=1)
+    )
     words = [line.split(" ") for line in text.decode().splitlines()]
     assert [(int(camera), int(point)) for camera, point, _, _ in words] == [row[:2] for row in rows]
     pixels = np.array([[float(x), float(y)] for _, _, x, y in words])

@@ -1,4 +1,5 @@
-"""BAL files: what is written reads back bit by bit, and every bad file is refused with one clear line."""
+"""BAL files: what is written reads back bit by bit, and every bad file is refused with one clear
+line."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA is not set")
 SUFFIXES = ["", ".bz2", ".gz", ".xz"]
 OPENERS = {"": open, ".bz2": bz2.open, ".gz": gzip.open, ".xz": lzma.open}
 
-# 2 cameras, 3 points, 4 observations: line 1 the counts, 2-5 the observations, 6-23 the cameras, 24-32 the points.
+# 2 cameras, 3 points, 4 observations: line 1 the counts, 2-5 the observations, 6-23 the cameras,
+# 24-32 the points.
 LINES = ["2 3 4", "0 0 1.5 -2.5", "1 0 3.25 4e0", "0 1 -5 6", "1 2 .5 7."]
 LINES += [str(number) for number in (*range(18), *range(100, 109))]
 
@@ -35,14 +37,25 @@ def text_of(changes: Mapping[int, str | None]) -> str:
     return "\n".join(line for line in lines if line is not None) + "\n"
 
 
-def random_problem(seed: int, *, cameras: int = 5, points: int = 40, observations: int = 300) -> BundleProblem:
-    """A problem whose numbers are random bit patterns: every exponent, subnormals and both zeros."""
+def random_problem(
+    seed: int, *, cameras: int = 5, points: int = 40, observations: int = 300
+) -> BundleProblem:
+    """A problem whose numbers are random bit patterns: every exponent, subnormals and both
+    zeros."""
     rng = np.random.default_rng(seed)
 
     def numbers(*shape: int) -> np.ndarray:
         values = rng.integers(0, 2**64, size=shape, dtype=np.uint64).view(np.float64)
         values = np.where(np.isfinite(values), values, 0.1)
-        special = [0.0, -0.0, 5e-324, -5e-324, 2.2250738585072014e-308, 2.225073858507201e-308, np.finfo(float).max]
+        special = [
+            0.0,
+            -0.0,
+            5e-324,
+            -5e-324,
+            2.2250738585072014e-308,
+            2.225073858507201e-308,
+            np.finfo(float).max,
+        ]
         return np.where(rng.random(shape) < 0.2, rng.choice(special, shape), values)
 
     return BundleProblem.create(
@@ -102,14 +115,22 @@ def test_same_problem_writes_same_bytes(tmp_path):
 def test_float32_and_jax_arrays_are_written_exactly(tmp_path):
     import jax.numpy as jnp
 
-    problem = BundleProblem.create(np.full((1, 9), 0.1), np.full((1, 3), 0.2), [[0.3, 0.4]], [0], [0])
-    narrow = problem.replace(cameras=jnp.full((1, 9), 0.1, dtype=jnp.float32), camera_index=jnp.zeros(1, jnp.int32))
+    problem = BundleProblem.create(
+        np.full((1, 9), 0.1), np.full((1, 3), 0.2), [[0.3, 0.4]], [0], [0]
+    )
+    narrow = problem.replace(
+        cameras=jnp.full((1, 9), 0.1, dtype=jnp.float32), camera_index=jnp.zeros(1, jnp.int32)
+    )
     write_bal(narrow, tmp_path / "a.txt")
-    np.testing.assert_array_equal(read_bal(tmp_path / "a.txt").cameras, np.full((1, 9), np.float32(0.1), np.float64))
+    np.testing.assert_array_equal(
+        read_bal(tmp_path / "a.txt").cameras, np.full((1, 9), np.float32(0.1), np.float64)
+    )
 
 
 def test_whitening_is_not_written(tmp_path):
-    problem = BundleProblem.create(np.ones((1, 9)), np.ones((1, 3)), [[1, 2]], [0], [0], weight=[4.0])
+    problem = BundleProblem.create(
+        np.ones((1, 9)), np.ones((1, 3)), [[1, 2]], [0], [0], weight=[4.0]
+    )
     write_bal(problem, tmp_path / "a.txt")
     assert read_bal(tmp_path / "a.txt").whitening is None
 
@@ -118,7 +139,9 @@ def test_compression_is_recognised_by_content_whatever_the_name(tmp_path):
     problem = random_problem(0)
     for suffix in SUFFIXES[1:]:
         write_bal(problem, tmp_path / f"a{suffix}")
-        assert_same_bits(read_bal((tmp_path / f"a{suffix}").rename(tmp_path / "plain.txt")), problem)
+        assert_same_bits(
+            read_bal((tmp_path / f"a{suffix}").rename(tmp_path / "plain.txt")), problem
+        )
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES[1:])
@@ -144,7 +167,9 @@ def test_where_blocks_are_cut_changes_nothing(tmp_path, monkeypatch, size, suffi
     monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", size)
     assert_same_bits(read_bal(good), problem)
     assert message_of(out).endswith(" line 4: '3' is outside 0..2 (point index of observation 2)")
-    assert message_of(bad).endswith("bad.txt" + suffix + " line 19: '1x' is not a number (translation y of camera 1)")
+    assert message_of(bad).endswith(
+        "bad.txt" + suffix + " line 19: '1x' is not a number (translation y of camera 1)"
+    )
 
 
 @pytest.mark.parametrize("separator", [" ", "\t", "\r\n", "\n", "\v", "\f", " \n\n  \t"])
@@ -157,12 +182,18 @@ def test_any_whitespace_separates(tmp_path, separator):
 NUMBER = "is not a number"
 FINITE = "is not a finite number"
 BAD_TEXTS = {
-    "word among the indices": ({3: "abc 0 1 2"}, f"line 3: 'abc' {NUMBER} (camera index of observation 1)"),
+    "word among the indices": (
+        {3: "abc 0 1 2"},
+        f"line 3: 'abc' {NUMBER} (camera index of observation 1)",
+    ),
     "word among the pixels": ({5: "1 2 0x1F 7"}, f"line 5: '0x1F' {NUMBER} (x of observation 3)"),
     "word among the cameras": ({6: "1_0"}, f"line 6: '1_0' {NUMBER} (rotation x of camera 0)"),
     "word among the points": ({32: "1.5.5"}, f"line 32: '1.5.5' {NUMBER} (z of point 2)"),
     "comma": ({2: "0 0 1.5, -2.5"}, f"line 2: '1.5,' {NUMBER} (x of observation 0)"),
-    "two numbers in one word": ({2: "0 0 1.5-2.5"}, f"line 2: '1.5-2.5' {NUMBER} (x of observation 0)"),
+    "two numbers in one word": (
+        {2: "0 0 1.5-2.5"},
+        f"line 2: '1.5-2.5' {NUMBER} (x of observation 0)",
+    ),
     "lone sign": ({2: "0 0 - 1"}, f"line 2: '-' {NUMBER} (x of observation 0)"),
     "non-ASCII word": ({2: "0 0 \u0661 1"}, f"line 2: '\\xd9\\xa1' {NUMBER} (x of observation 0)"),
     "long word": ({2: "0 0 " + 50 * "z"}, f"line 2: '{37 * 'z'}...' {NUMBER} (x of observation 0)"),
@@ -171,27 +202,57 @@ BAD_TEXTS = {
     "minus infinity": ({14: "-Infinity"}, f"line 14: '-Infinity' {FINITE} (k2 of camera 0)"),
     "overflow": ({24: "1e400"}, f"line 24: '1e400' {FINITE} (x of point 0)"),
     "infinite index": ({4: "inf 1 5 6"}, f"line 4: 'inf' {FINITE} (camera index of observation 2)"),
-    "camera out of range": ({3: "2 0 1 2"}, "line 3: '2' is outside 0..1 (camera index of observation 1)"),
-    "point out of range": ({3: "1 3 1 2"}, "line 3: '3' is outside 0..2 (point index of observation 1)"),
-    "negative index": ({2: "-1 0 1 2"}, "line 2: '-1' is outside 0..1 (camera index of observation 0)"),
-    "huge index": ({2: "1e300 0 1 2"}, "line 2: '1e300' is outside 0..1 (camera index of observation 0)"),
-    "index with a fraction": ({2: "0 1.5 1 2"}, "line 2: '1.5' is not an integer (point index of observation 0)"),
+    "camera out of range": (
+        {3: "2 0 1 2"},
+        "line 3: '2' is outside 0..1 (camera index of observation 1)",
+    ),
+    "point out of range": (
+        {3: "1 3 1 2"},
+        "line 3: '3' is outside 0..2 (point index of observation 1)",
+    ),
+    "negative index": (
+        {2: "-1 0 1 2"},
+        "line 2: '-1' is outside 0..1 (camera index of observation 0)",
+    ),
+    "huge index": (
+        {2: "1e300 0 1 2"},
+        "line 2: '1e300' is outside 0..1 (camera index of observation 0)",
+    ),
+    "index with a fraction": (
+        {2: "0 1.5 1 2"},
+        "line 2: '1.5' is not an integer (point index of observation 0)",
+    ),
     "count with a fraction": ({1: "2 3.5 4"}, "line 1: '3.5' is not an integer (number of points)"),
     "word as a count": ({1: "two 3 4"}, f"line 1: 'two' {NUMBER} (number of cameras)"),
     "negative count": ({1: "-2 3 4"}, "line 1: '-2' is outside 1..2147483647 (number of cameras)"),
     "no points": ({1: "2 0 4"}, "line 1: '0' is outside 1..2147483647 (number of points)"),
-    "no observations": ({1: "2 3 0"}, "line 1: '0' is outside 1..2147483647 (number of observations)"),
-    "absurd count": ({1: "2 3 1e18"}, "line 1: '1e18' is outside 1..2147483647 (number of observations)"),
+    "no observations": (
+        {1: "2 3 0"},
+        "line 1: '0' is outside 1..2147483647 (number of observations)",
+    ),
+    "absurd count": (
+        {1: "2 3 1e18"},
+        "line 1: '1e18' is outside 1..2147483647 (number of observations)",
+    ),
     "huge count of observations": (
         {1: "2 3 2147483647"},
         "line 10: '4' is outside 0..1 (camera index of observation 5)",
     ),
-    "huge count of cameras": ({1: "2147483647 3 4"}, "line 32: the file ends before the rotation x of camera 3"),
-    "huge count of points": ({1: "2 2147483647 4"}, "line 32: the file ends before the x of point 3"),
+    "huge count of cameras": (
+        {1: "2147483647 3 4"},
+        "line 32: the file ends before the rotation x of camera 3",
+    ),
+    "huge count of points": (
+        {1: "2 2147483647 4"},
+        "line 32: the file ends before the x of point 3",
+    ),
     "line left over": ({32: "108\n109"}, "line 33: '109' is left over after the last number"),
     "word left over": ({32: "108\n\n end"}, "line 34: 'end' is left over after the last number"),
     "number left out": ({20: None}, "line 31: the file ends before the z of point 2"),
-    "word and later a left-over": ({8: "x", 32: "1 2 3"}, f"line 8: 'x' {NUMBER} (rotation z of camera 0)"),
+    "word and later a left-over": (
+        {8: "x", 32: "1 2 3"},
+        f"line 8: 'x' {NUMBER} (rotation z of camera 0)",
+    ),
     "bad index, then a bad word": ({2: "9 0 1 2", 3: "x"}, "line 2: '9' is outside 0..1"),
 }
 
@@ -215,7 +276,16 @@ def test_every_truncation_between_numbers_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"\n", b"\0", b"\xff\xfe2\x00 \x003\x00", b"\x89PNG\r\n\x1a\n\0\0", b"2 3 \0 4", b"7" * 200_000, bytes(5000)],
+    [
+        b"",
+        b"\n",
+        b"\0",
+        b"\xff\xfe2\x00 \x003\x00",
+        b"\x89PNG\r\n\x1a\n\0\0",
+        b"2 3 \0 4",
+        b"7" * 200_000,
+        bytes(5000),
+    ],
     ids=["empty", "blank", "nul", "utf-16", "png", "nul word", "one long word", "zeros"],
 )
 def test_a_file_that_is_no_text_of_numbers_is_refused(tmp_path, content):
@@ -226,7 +296,9 @@ def test_a_file_that_is_no_text_of_numbers_is_refused(tmp_path, content):
 
 def test_a_number_of_many_digits_is_rounded_correctly(tmp_path):
     exact = f"{2**-1074:.1074f}"  # all digits of the smallest subnormal
-    (tmp_path / "a.txt").write_text(text_of({24: exact, 25: "1" + 300 * "0", 26: "0." + 400 * "0" + "1"}))
+    (tmp_path / "a.txt").write_text(
+        text_of({24: exact, 25: "1" + 300 * "0", 26: "0." + 400 * "0" + "1"})
+    )
     assert read_bal(tmp_path / "a.txt").points[0].tolist() == [5e-324, 1e300, 0.0]
 
 
@@ -271,7 +343,9 @@ def test_a_name_of_control_characters_stays_on_one_line(tmp_path):
         read_bal(tmp_path / "a\nb\0\ud800.txt")
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything"
+)
 def test_an_unreadable_file_is_refused(tmp_path):
     path = tmp_path / "secret.txt"
     path.write_text(text_of({}))
@@ -316,7 +390,13 @@ def test_reading_and_writing_take_a_few_blocks_beyond_the_problem(tmp_path, monk
     found = read_bal(path)
     read = tracemalloc.get_traced_memory()[1] - before
     tracemalloc.stop()
-    arrays = (found.cameras, found.points, found.observations, found.camera_index, found.point_index)
+    arrays = (
+        found.cameras,
+        found.points,
+        found.observations,
+        found.camera_index,
+        found.point_index,
+    )
     own = sum(array.nbytes for array in arrays)
     assert_same_bits(found, problem)
     assert written < 40 * (1 << 16)
@@ -375,9 +455,13 @@ class TestWriting:
     def test_a_new_file_has_the_usual_permissions(self, tmp_path):
         (tmp_path / "usual").write_text("")
         write_bal(random_problem(0), tmp_path / "a.txt")
-        assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == stat.S_IMODE((tmp_path / "usual").stat().st_mode)
+        assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == stat.S_IMODE(
+            (tmp_path / "usual").stat().st_mode
+        )
 
-    @pytest.mark.skipif(not os.path.exists(os.devnull) or os.name != "posix", reason="needs device files")
+    @pytest.mark.skipif(
+        not os.path.exists(os.devnull) or os.name != "posix", reason="needs device files"
+    )
     def test_a_device_is_written_and_not_replaced(self):
         write_bal(random_problem(0), os.devnull)
         assert stat.S_ISCHR(os.stat(os.devnull).st_mode)
@@ -394,7 +478,11 @@ class TestWriting:
 def test_real_problems_have_the_sizes_and_costs_of_the_reference():
     folder = Path(str(DATA))
     reference = json.loads((folder / "reference.json").read_text())
-    paths = [path for path in sorted(folder.glob("bal*/*.txt.bz2")) if path.name[: -len(".txt.bz2")] in reference]
+    paths = [
+        path
+        for path in sorted(folder.glob("bal*/*.txt.bz2"))
+        if path.name[: -len(".txt.bz2")] in reference
+    ]
     assert len(paths) >= 10
     for path in paths:
         expected = reference[path.name[: -len(".txt.bz2")]]
@@ -412,7 +500,8 @@ def test_real_problem_round_trips(tmp_path):
 
 
 def _cost(problem: BundleProblem) -> np.ndarray:
-    """The cost by a rotation matrix per camera from the matrix exponential's series: independent of the package."""
+    """The cost by a rotation matrix per camera from the matrix exponential's series: independent of
+    the package."""
     cameras, points = np.asarray(problem.cameras), np.asarray(problem.points)
     x, y, z = cameras[:, :3].T / 1024
     zero = np.zeros_like(x)
@@ -424,8 +513,13 @@ def _cost(problem: BundleProblem) -> np.ndarray:
     for _ in range(10):
         rotation = rotation @ rotation
     camera = cameras[problem.camera_index]
-    seen = np.einsum("nij,nj->ni", rotation[problem.camera_index], points[problem.point_index]) + camera[:, 3:6]
+    seen = (
+        np.einsum("nij,nj->ni", rotation[problem.camera_index], points[problem.point_index])
+        + camera[:, 3:6]
+    )
     projected = -seen[:, :2] / seen[:, 2:]
     square = np.sum(projected**2, axis=1)
-    pixels = (camera[:, 6] * (1 + camera[:, 7] * square + camera[:, 8] * square**2))[:, None] * projected
+    pixels = (camera[:, 6] * (1 + camera[:, 7] * square + camera[:, 8] * square**2))[
+        :, None
+    ] * projected
     return 0.5 * np.sum((pixels - problem.observations) ** 2)

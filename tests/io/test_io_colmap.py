@@ -1,4 +1,5 @@
-"""COLMAP models: costs are COLMAP's, what is written is read back bit by bit, and what cannot be is refused.
+"""COLMAP models: costs are COLMAP's, what is written is read back bit by bit, and what cannot be is
+refused.
 
 The truth is COLMAP itself: its projection, and its own bundle adjustment.
 """
@@ -55,14 +56,17 @@ REAL = ("bulani7", "yding", "ranjith")
 
 
 def model_of(kinds: list[str], seed: int = 0):
-    """The cameras and points of a random scene behind lenses in turn, seen with half a pixel of noise.
+    """The cameras and points of a random scene behind lenses in turn, seen with half a pixel of
+    noise.
 
-    Ids have gaps and come in no order; one image is not registered, and one key-point of each belongs to no point.
-    """
+    Ids have gaps and come in no order; one image is not registered, and one key-point of each
+    belongs to no point."""
     scene = support.paper(seed)
     model = pycolmap.Reconstruction()
     for number, kind in enumerate(kinds):
-        lens = pycolmap.Camera(camera_id=9 - 3 * number, model=kind, width=SIZE[0], height=SIZE[1], params=LENSES[kind])
+        lens = pycolmap.Camera(
+            camera_id=9 - 3 * number, model=kind, width=SIZE[0], height=SIZE[1], params=LENSES[kind]
+        )
         model.add_camera_with_trivial_rig(lens)
     rng = np.random.default_rng(seed)
     matrices = geometry.rotation_matrices(scene.cameras[:, :3])
@@ -73,8 +77,12 @@ def model_of(kinds: list[str], seed: int = 0):
         rotation, shift = flip @ matrices[camera], flip @ scene.cameras[camera, 3:6]
         keys = model.camera(lens_id).img_from_cam(scene.points @ rotation.T + shift)
         keys = np.vstack([[[1.0, 2.0]], keys + rng.normal(scale=0.5, size=keys.shape)])
-        image = pycolmap.Image(name=f"{identity}.png", keypoints=keys, camera_id=lens_id, image_id=identity)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift))
+        image = pycolmap.Image(
+            name=f"{identity}.png", keypoints=keys, camera_id=lens_id, image_id=identity
+        )
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift)
+        )
     absent = pycolmap.Image(name="absent.png", keypoints=np.zeros((3, 2)), camera_id=9, image_id=99)
     model.add_image_with_trivial_frame(absent)
     for point in range(scene.num_points):
@@ -126,7 +134,11 @@ def adjusted_by_colmap(folder: Path | str, target: Path, lenses: bool, **free: b
 def test_the_cost_is_that_of_colmap(tmp_path, kinds, text):
     folder = write(model_of(kinds), tmp_path / "model", text)
     problem = read_problem(folder)
-    assert (problem.num_cameras, problem.num_points, problem.num_observations) == (10, 10, 10 * 10 - 9)
+    assert (problem.num_cameras, problem.num_points, problem.num_observations) == (
+        10,
+        10,
+        10 * 10 - 9,
+    )
     np.testing.assert_allclose(geometry.cost(problem), colmap_cost(folder), rtol=1e-9)
 
 
@@ -140,27 +152,47 @@ def test_images_of_one_camera_share_a_lens_whose_model_says_what_is_free(tmp_pat
     mixed = read_colmap(write(model_of(["PINHOLE", "OPENCV"]), tmp_path / "mixed"))
     assert mixed.lenses is not None
     assert [model.name for model in mixed.lenses.models] == ["OPENCV", "PINHOLE"]
-    assert mixed.lenses.free.astype(int).tolist() == [[1, 1, 0, 0, 1, 1, 1, 1], [1, 1, 0, 0, 0, 0, 0, 0]]
+    assert mixed.lenses.free.astype(int).tolist() == [
+        [1, 1, 0, 0, 1, 1, 1, 1],
+        [1, 1, 0, 0, 0, 0, 0, 0],
+    ]
 
 
 @pytest.mark.parametrize("kind", sorted(set(CAMERA_MODELS) - {"BAL"}))
 def test_pixels_of_every_camera_model_are_colmaps(kind):
     rng = np.random.default_rng(0)
     model = CAMERA_MODELS[kind]
-    start = {"omega": 0.8, "alpha": 0.6, "beta": 1.1, "width": 640.0, "height": 320.0, "cx": 320.0, "cy": 240.0}
+    start = {
+        "omega": 0.8,
+        "alpha": 0.6,
+        "beta": 1.1,
+        "width": 640.0,
+        "height": 320.0,
+        "cx": 320.0,
+        "cy": 240.0,
+    }
     focals = dict.fromkeys(("f", "fx", "fy"), 500.0)
     lens = [{**start, **focals}.get(name, 0.0) * rng.uniform(0.9, 1.1) for name in model.parameters]
     lens = [number or rng.uniform(-0.02, 0.02) for number in lens]
     points = rng.normal(size=(200, 3)) * [0.4, 0.4, 0.2] + [0, 0, 1.2]
     points[0, :2] = 0  # on the axis
-    truth = np.array(pycolmap.Camera(model=kind, width=640, height=480, params=lens).img_from_cam(points))
+    truth = np.array(
+        pycolmap.Camera(model=kind, width=640, height=480, params=lens).img_from_cam(points)
+    )
     numbers = [np.float64(number) for number in lens]
-    np.testing.assert_allclose(np.stack(model.project(numbers, *points.T), axis=1), truth, rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(
+        np.stack(model.project(numbers, *points.T), axis=1), truth, rtol=1e-12, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize(
     "kinds",
-    [["RADIAL"], ["SIMPLE_PINHOLE", "RADIAL"], ["OPENCV"], ["PINHOLE", "OPENCV_FISHEYE", "SIMPLE_RADIAL"]],
+    [
+        ["RADIAL"],
+        ["SIMPLE_PINHOLE", "RADIAL"],
+        ["OPENCV"],
+        ["PINHOLE", "OPENCV_FISHEYE", "SIMPLE_RADIAL"],
+    ],
     ids="+".join,
 )
 def test_a_solve_ends_where_colmaps_own_bundle_adjustment_does(tmp_path, kinds):
@@ -179,7 +211,9 @@ def test_what_is_written_is_read_back_and_the_rest_is_as_it_was(tmp_path, text):
     problem = read_problem(folder)
     rng = np.random.default_rng(1)
     cameras = problem.cameras + 1e-3 * rng.normal(size=problem.cameras.shape)
-    first = np.array([np.flatnonzero(problem.lenses.index == lens)[0] for lens in problem.lenses.index])
+    first = np.array(
+        [np.flatnonzero(problem.lenses.index == lens)[0] for lens in problem.lenses.index]
+    )
     held = ~problem.lenses.free[problem.lenses.index]
     cameras[:, 6:] = np.where(held, problem.cameras[:, 6:], cameras[first, 6:])
     changed = problem.replace(cameras=cameras, points=problem.points + 0.1)
@@ -192,7 +226,9 @@ def test_what_is_written_is_read_back_and_the_rest_is_as_it_was(tmp_path, text):
     assert (back.camera_index == problem.camera_index).all()
     assert (back.point_index == problem.point_index).all()
     before, after = (pycolmap.Reconstruction(str(place)) for place in (folder, tmp_path / "out"))
-    assert {i: image.name for i, image in before.images.items()} == {i: image.name for i, image in after.images.items()}
+    assert {i: image.name for i, image in before.images.items()} == {
+        i: image.name for i, image in after.images.items()
+    }
     assert after.num_reg_images() == 10
     assert set(after.point3D_ids()) == set(before.point3D_ids())
 
@@ -225,17 +261,26 @@ def test_the_command_solves_a_model_and_writes_one_or_a_file(tmp_path, capsys):
 
 
 def test_the_heading_counts_lenses_by_what_is_free(tmp_path, capsys):
-    folder = write(model_of(["RADIAL", "OPENCV", "SIMPLE_PINHOLE", "SIMPLE_PINHOLE"]), tmp_path / "model")
+    folder = write(
+        model_of(["RADIAL", "OPENCV", "SIMPLE_PINHOLE", "SIMPLE_PINHOLE"]), tmp_path / "model"
+    )
     assert run([str(folder), "--max-iterations", "1"]) == 0
-    assert "2 SIMPLE_PINHOLE (f), 1 OPENCV (fx, fy, k1, k2, p1, p2), 1 RADIAL (f, k1, k2)" in capsys.readouterr().out
+    assert (
+        "2 SIMPLE_PINHOLE (f), 1 OPENCV (fx, fy, k1, k2, p1, p2), 1 RADIAL (f, k1, k2)"
+        in capsys.readouterr().out
+    )
 
 
 def test_a_name_with_a_dot_is_a_folder_and_a_file_says_what_it_lacks(tmp_path, capsys):
     folder = write(model_of(["PINHOLE"]), tmp_path / "model")
-    assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "refined.v2")]) == 0
+    assert (
+        run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "refined.v2")]) == 0
+    )
     assert (tmp_path / "refined.v2" / "cameras.bin").is_file()
     assert "cannot store" not in capsys.readouterr().out
-    assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "flat.txt.gz")]) == 2
+    assert (
+        run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "flat.txt.gz")]) == 2
+    )
     assert capsys.readouterr().err.endswith("it would hold BAL's lenses only, not PINHOLE\n")
 
 
@@ -250,8 +295,13 @@ def test_robust_losses_and_the_search_for_points_work_with_shared_lenses(tmp_pat
 def test_fixed_lenses_stay_bit_by_bit_in_float32(tmp_path):
     folder = write(model_of(["PINHOLE", "RADIAL"]), tmp_path / "model")
     for arguments in (["--intrinsics", "fixed"], []):
-        assert run([str(folder), "--dtype", "float32", *arguments, "--output", str(tmp_path / "out")]) == 0
-        before, after = (pycolmap.Reconstruction(str(place)) for place in (folder, tmp_path / "out"))
+        assert (
+            run([str(folder), "--dtype", "float32", *arguments, "--output", str(tmp_path / "out")])
+            == 0
+        )
+        before, after = (
+            pycolmap.Reconstruction(str(place)) for place in (folder, tmp_path / "out")
+        )
         for identity in (6, 9):
             same = before.camera(identity).params == after.camera(identity).params
             assert same.all() if arguments else same.tolist()[-2:] == [identity == 9, identity == 9]
@@ -267,7 +317,9 @@ def test_a_benchmark_takes_models_and_skips_what_a_solver_refuses(tmp_path, caps
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 2
     assert errors[0].startswith("error: garden-sparse-0, stba+ceres: shared lenses need plain LM")
-    assert errors[1].startswith("error: garden-sparse-0, pyceres:dense: Ceres as a peer takes no covariances")
+    assert errors[1].startswith(
+        "error: garden-sparse-0, pyceres:dense: Ceres as a peer takes no covariances"
+    )
     assert [record.solver for record in json_lines.read(out / "results.jsonl", Record)] == ["ceres"]
     assert (out / "report.html").is_file()
 
@@ -280,7 +332,9 @@ def test_point_errors_in_the_written_model_are_those_of_the_solution(tmp_path):
     errors = []
     for view in point.track.elements:
         image = model.image(view.image_id)
-        errors.append(np.linalg.norm(image.project_point(point.xyz) - image.point2D(view.point2D_idx).xy))
+        errors.append(
+            np.linalg.norm(image.project_point(point.xyz) - image.point2D(view.point2D_idx).xy)
+        )
     np.testing.assert_allclose(point.error, np.mean(errors), rtol=1e-9)
 
 
@@ -409,7 +463,11 @@ def rigs_of(cameras: int):
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, cameras, 5
     options.num_points3D, options.num_points2D_without_point3D = 60, 0
     model = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = 0.5, 0.02, 0.3
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
+        0.5,
+        0.02,
+        0.3,
+    )
     pycolmap.synthesize_noise(noise, model)
     return model
 
@@ -422,17 +480,26 @@ def test_rigs_end_where_colmap_has_them_and_are_written_as_rigs(tmp_path, linear
     assert problem.rigs.free.sum() == 20  # two of three cameras in ten frames
     problem = hold(problem, extrinsics="all" if places == "constant" else ())
     np.testing.assert_allclose(geometry.cost(problem), colmap_cost(folder), rtol=1e-9)
-    solution = solve(problem, "ceres", SolveOptions(linear_solver=linear_solver, max_iterations=100))
-    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True, refine_sensor_from_rig=places == "free")
+    solution = solve(
+        problem, "ceres", SolveOptions(linear_solver=linear_solver, max_iterations=100)
+    )
+    truth = adjusted_by_colmap(
+        folder, tmp_path / "truth", lenses=True, refine_sensor_from_rig=places == "free"
+    )
     np.testing.assert_allclose(solution.final_cost, truth, rtol=1e-5)
     write_colmap(solution.problem, tmp_path / "out", like=folder)
     np.testing.assert_allclose(colmap_cost(tmp_path / "out"), solution.final_cost, rtol=1e-9)
-    np.testing.assert_allclose(geometry.cost(read_problem(tmp_path / "out")), solution.final_cost, rtol=1e-9)
+    np.testing.assert_allclose(
+        geometry.cost(read_problem(tmp_path / "out")), solution.final_cost, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
     ("held", "option"),
-    [("frames", {"refine_rig_from_world": False}), ("frame-rotations", {"constant_rig_from_world_rotation": True})],
+    [
+        ("frames", {"refine_rig_from_world": False}),
+        ("frame-rotations", {"constant_rig_from_world_rotation": True}),
+    ],
 )
 def test_frames_that_are_constant_let_places_in_rigs_move_as_in_colmap(tmp_path, held, option):
     folder = write(rigs_of(3), tmp_path / "model")
@@ -454,7 +521,9 @@ def test_a_rig_that_does_not_say_where_a_camera_is_is_refused(tmp_path):
 
 def test_a_lens_without_a_focal_length_has_colmaps_cost_and_is_constant(tmp_path):
     model = model_of(["RADIAL"])
-    lens = pycolmap.Camera(camera_id=80, model="EQUIRECTANGULAR", width=SIZE[0], height=SIZE[1], params=list(SIZE))
+    lens = pycolmap.Camera(
+        camera_id=80, model="EQUIRECTANGULAR", width=SIZE[0], height=SIZE[1], params=list(SIZE)
+    )
     model.add_camera_with_trivial_rig(lens)
     seen = np.array([point.xyz for _, point in sorted(model.points3D.items())])
     keys = np.array(lens.img_from_cam(seen)) + 1.0
@@ -484,14 +553,26 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_any_work(tmp_pat
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
     assert run([str(folder), "--output", str(tmp_path / "none" / "out")]) == 2
     printed = capsys.readouterr()
-    assert printed.err == f"error: --output {tmp_path}/none/out: folder {tmp_path}/none does not exist\n"
+    assert (
+        printed.err
+        == f"error: --output {tmp_path}/none/out: folder {tmp_path}/none does not exist\n"
+    )
     assert printed.out == ""
 
 
 def test_no_lens_needs_pycolmap(tmp_path):
     folder = write(model_of(["RADIAL", "OPENCV"]), tmp_path / "model")
     program = "import sys; sys.modules['pycolmap'] = None; from jaxba.cli.solve import main; main()"
-    command = [sys.executable, "-c", program, str(folder), "--max-iterations", "1", "--output", str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        "-c",
+        program,
+        str(folder),
+        "--max-iterations",
+        "1",
+        "--output",
+        str(tmp_path / "out"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert pycolmap.Reconstruction(str(tmp_path / "out")).num_points3D() == 10
@@ -504,7 +585,9 @@ def test_no_lens_needs_pycolmap(tmp_path):
 @pytest.mark.parametrize("name", REAL)
 def test_real_models_have_colmaps_cost(name):
     problem = read_problem(f"{DATA}/colmap/{name}")
-    np.testing.assert_allclose(geometry.cost(problem), colmap_cost(f"{DATA}/colmap/{name}"), rtol=1e-9)
+    np.testing.assert_allclose(
+        geometry.cost(problem), colmap_cost(f"{DATA}/colmap/{name}"), rtol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -523,7 +606,9 @@ def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
     problem = read_problem(folder)
     rng = np.random.default_rng(2)
-    far: BundleProblem = problem.replace(points=problem.points + rng.normal(scale=0.3, size=problem.points.shape))
+    far: BundleProblem = problem.replace(
+        points=problem.points + rng.normal(scale=0.3, size=problem.points.shape)
+    )
     near = solve(problem, "bold").final_cost
     options = SolveOptions(refinement=Refinement(points=3))
     np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)
@@ -536,7 +621,10 @@ def test_covariances_are_colmaps(tmp_path):
     points = [0, 20, 40]
     found = covariance(hold(problem, points=points))
     model = pycolmap.Reconstruction(str(tmp_path / "solved"))
-    options, config = pycolmap.BundleAdjustmentOptions(print_summary=False), pycolmap.BundleAdjustmentConfig()
+    options, config = (
+        pycolmap.BundleAdjustmentOptions(print_summary=False),
+        pycolmap.BundleAdjustmentConfig(),
+    )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     for identity in model.reg_image_ids():
         config.add_image(identity)

@@ -87,17 +87,25 @@ def test_opensfm_s_other_cameras_keep_the_cost(tmp_path, model, lens, moves):
     [
         (["brown"], [BROWN], [[]]),
         (["fisheye_opencv"], [FISHEYE4], [[]]),
-        (["brown", "radial"], [BROWN, Lens(fy=1230.0, radial=(0.1, 0.0))], [[], ["fx", "fy", "k1", "k2"]]),
+        (
+            ["brown", "radial"],
+            [BROWN, Lens(fy=1230.0, radial=(0.1, 0.0))],
+            [[], ["fx", "fy", "k1", "k2"]],
+        ),
         (["fisheye_opencv", "simple_radial"], [FISHEYE4, Lens(radial=(-0.1,))], [[], ["f", "k1"]]),
     ],
 )
-def test_lenses_that_bal_lacks_keep_their_numbers_so_a_colmap_model_has_them_too(tmp_path, models, lenses, moves):
+def test_lenses_that_bal_lacks_keep_their_numbers_so_a_colmap_model_has_them_too(
+    tmp_path, models, lenses, moves
+):
     scene = scene_of(*lenses)
     problem = read_problem(write_opensfm(tmp_path, scene, models))
     check(problem, scene, ROUNDING)
     assert optimised(problem) == moves
     write_colmap(problem, tmp_path / "model")
-    np.testing.assert_allclose(geometry.cost(read_colmap(tmp_path / "model")), scene.cost, rtol=ROUNDING)
+    np.testing.assert_allclose(
+        geometry.cost(read_colmap(tmp_path / "model")), scene.cost, rtol=ROUNDING
+    )
 
 
 def test_images_that_see_no_point_are_left_out_and_counted(tmp_path):
@@ -109,18 +117,24 @@ def test_images_that_see_no_point_are_left_out_and_counted(tmp_path):
     with pytest.warns(ProblemWarning, match="1 of 5 images left out: they see no point"):
         problem = read_problem(path)
     assert problem.num_observations == sum(image != 1 for image, _ in scene.seen)
-    np.testing.assert_allclose(geometry.camera_centers(problem.cameras), np.delete(scene.centers, 1, 0), atol=1e-9)
+    np.testing.assert_allclose(
+        geometry.camera_centers(problem.cameras), np.delete(scene.centers, 1, 0), atol=1e-9
+    )
 
 
 def test_a_principal_point_at_the_edge_is_noted(tmp_path):
     path = write_opensfm(tmp_path, scene_of(Lens(cx=0.0, cy=0.0)), ["simple_radial"])
-    with pytest.warns(ProblemWarning, match=r"maker 0 lies at the edge of the image: \(0, 0\) of 1600 x 1200"):
+    with pytest.warns(
+        ProblemWarning, match=r"maker 0 lies at the edge of the image: \(0, 0\) of 1600 x 1200"
+    ):
         read_problem(path)
 
 
 def test_only_the_first_reconstruction_is_read_and_that_is_said(tmp_path):
     path = write_opensfm(tmp_path, scene_of(PINHOLE), ["perspective"])
-    path.write_text(json.dumps([*json.loads(path.read_text()), {"cameras": {}, "shots": {}, "points": {}}]))
+    path.write_text(
+        json.dumps([*json.loads(path.read_text()), {"cameras": {}, "shots": {}, "points": {}}])
+    )
     with pytest.warns(ProblemWarning, match="only the first of 2 reconstructions is read"):
         assert read_problem(path).num_cameras == 5
 
@@ -134,7 +148,11 @@ def changed_json(path, change):
 
 def with_positions(contents):
     shots = list(contents[0]["shots"].values())
-    shots[0]["gps_position"], shots[1]["gps_position"], shots[2]["gps_position"] = [1, 2, 3], [0.0, 0.0, 0.0], None
+    shots[0]["gps_position"], shots[1]["gps_position"], shots[2]["gps_position"] = (
+        [1, 2, 3],
+        [0.0, 0.0, 0.0],
+        None,
+    )
     next(iter(contents[0]["cameras"].values()))["focal_prior"] = 0.8
 
 
@@ -154,7 +172,8 @@ def test_what_a_file_holds_and_nothing_uses_is_one_note_and_refused_if_strict(tm
     scene = scene_of(PINHOLE)
     check(found, scene, ROUNDING)
     wanted = (
-        f"{path}: not used: measured positions (1), priors of cameras (1), gcp_list.txt beside it (1), scales of "
+        f"{path}: not used: measured positions (1), priors of cameras (1), gcp_list.txt beside it "
+        "(1), scales of "
         f"key-points ({len(scene.seen)})"
     )
     assert [str(one.message) for one in caught] == [wanted]
@@ -167,7 +186,9 @@ def test_compressed_marked_and_windows_files_are_read_too(tmp_path):
     path = write_opensfm(tmp_path, scene, ["perspective"])
     text, tracks = path.read_text(), (tmp_path / "tracks.csv").read_bytes()
     (tmp_path / "tracks.csv").unlink()
-    (tmp_path / "tracks.csv.gz").write_bytes(gzip.compress(b"\xef\xbb\xbf" + tracks.replace(b"\n", b"\r\n")))
+    (tmp_path / "tracks.csv.gz").write_bytes(
+        gzip.compress(b"\xef\xbb\xbf" + tracks.replace(b"\n", b"\r\n"))
+    )
     path.write_bytes(text.encode("utf-16"))
     check(read_problem(path), scene, ROUNDING)
 
@@ -190,15 +211,31 @@ OPENSFM = {
         '"spherical"',
         "camera v2 maker 0 has projection_type 'spherical', which is not",
     ),
-    "dangling camera": ('"camera": "v2 maker 0"', '"camera": "v2 x"', "shot a shot 0.jpg names camera v2 x, which is"),
-    "text for a number": ('"focal": 0.75', '"focal": "wide"', "camera v2 maker 0: focal must be a number, is 'wide'"),
-    "nan": ('"focal": 0.75', '"focal": NaN', "camera v2 maker 0: focal is not a finite number: nan"),
+    "dangling camera": (
+        '"camera": "v2 maker 0"',
+        '"camera": "v2 x"',
+        "shot a shot 0.jpg names camera v2 x, which is",
+    ),
+    "text for a number": (
+        '"focal": 0.75',
+        '"focal": "wide"',
+        "camera v2 maker 0: focal must be a number, is 'wide'",
+    ),
+    "nan": (
+        '"focal": 0.75',
+        '"focal": NaN',
+        "camera v2 maker 0: focal is not a finite number: nan",
+    ),
     "negative focal length": (
         '"focal": 0.75',
         '"focal": -0.75',
         "camera v2 maker 0 has focal length -1200, which must",
     ),
-    "a key twice": ('"width": 1600', '"width": 1600, "width": 1601', "the key 'width' is there twice in one object"),
+    "a key twice": (
+        '"width": 1600',
+        '"width": 1600, "width": 1601',
+        "the key 'width' is there twice in one object",
+    ),
     "no width": ('"width": 1600', '"width": 0', "camera v2 maker 0 has no width and height"),
     "no rotation": ('"rotation"', '"turn"', "shot a shot 0.jpg has no rotation"),
     "short point": (
@@ -257,7 +294,11 @@ def test_a_reconstruction_without_tracks_is_refused(tmp_path):
     ("contents", "words"),
     [
         ("[" * 100_000, "is nested too deeply"),
-        ("[]", "is JSON, but not OpenSfM's: have its program write a COLMAP model; read are BAL (.txt, .bal)"),
+        (
+            "[]",
+            "is JSON, but not OpenSfM's: have its program write a COLMAP model; read are BAL "
+            "(.txt, .bal)",
+        ),
         ('{"a": 1}', "is JSON, but not OpenSfM's"),
         ("", "line 1: not JSON: Expecting value"),
         ('{"shots": ' + "1" * 10_000 + "}", "holds a number of too many digits"),

@@ -21,7 +21,9 @@ WRITTEN = (
 )
 
 
-@pytest.mark.parametrize("name", ["a.nvm", "a.zip", "a.SFM", "a.abc", "a.nvm.gz", "a.npz", "a.mat", "a.tar.gz"])
+@pytest.mark.parametrize(
+    "name", ["a.nvm", "a.zip", "a.SFM", "a.abc", "a.nvm.gz", "a.npz", "a.mat", "a.tar.gz"]
+)
 def test_endings_of_other_formats_are_not_written(name, tmp_path):
     with pytest.raises(ProblemError, match="are not written; ") as caught:
         write_problem(support.tiny(), tmp_path / name)
@@ -30,7 +32,20 @@ def test_endings_of_other_formats_are_not_written(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["a", "a.txt", "a.BAL", "a.OUT.xz", "a.ply", "a.json", "a.5", "/dev/stdout", "a.b.txt", "json", "a.txt.bz2"]
+    "name",
+    [
+        "a",
+        "a.txt",
+        "a.BAL",
+        "a.OUT.xz",
+        "a.ply",
+        "a.json",
+        "a.5",
+        "/dev/stdout",
+        "a.b.txt",
+        "json",
+        "a.txt.bz2",
+    ],
 )
 def test_other_names_may_be_written(name):
     check_output(name)
@@ -56,14 +71,19 @@ def test_an_output_of_another_format_is_refused_before_any_work(tiny, capsys, na
 
 
 def test_a_model_goes_from_bundler_to_bundler(tiny, capsys):
-    assert run([str(tiny), "--output", str(tiny.with_name("solved.OUT.GZ")), "--max-iterations", "2"]) == 0
+    assert (
+        run([str(tiny), "--output", str(tiny.with_name("solved.OUT.GZ")), "--max-iterations", "2"])
+        == 0
+    )
     assert "note" not in capsys.readouterr().out
     solved = read_problem(tiny.with_name("solved.OUT.GZ"))
     assert solved.num_observations == support.tiny().num_observations
 
 
 def test_a_name_whose_ending_says_nothing_is_bal_and_that_is_said(tiny, capsys):
-    assert run([str(tiny), "--output", str(tiny.with_name("solved.v5")), "--max-iterations", "1"]) == 0
+    assert (
+        run([str(tiny), "--output", str(tiny.with_name("solved.v5")), "--max-iterations", "1"]) == 0
+    )
     assert "solved.v5 is a BAL file; written are" in capsys.readouterr().out
 
 
@@ -71,14 +91,21 @@ def test_what_readers_remark_is_printed_as_notes(tmp_path, capsys):
     path = write_opensfm(tmp_path, Scene([Lens(cx=0.0)], [0, 0, 0]), ["simple_radial"])
     assert run([str(path), "--max-iterations", "1", "--output", str(tmp_path / "a.txt")]) == 0
     printed = capsys.readouterr()
-    assert printed.out.startswith(f"note: {path}: the principal point of camera v2 maker 0 lies at the edge")
-    assert "note: that file cannot store: which images share a lens, which numbers of a lens are" in printed.out
+    assert printed.out.startswith(
+        f"note: {path}: the principal point of camera v2 maker 0 lies at the edge"
+    )
+    assert (
+        "note: that file cannot store: which images share a lens, which numbers of a lens are"
+        in printed.out
+    )
     assert printed.err == ""
 
 
 def test_what_is_remarked_is_refused_if_asked(tmp_path):
     path = write_opensfm(tmp_path, Scene([Lens(cx=0.0)], [0, 0, 0]), ["simple_radial"])
-    with pytest.raises(ProblemError, match=r"reconstruction\.json: the principal point of camera v2 maker 0 lies"):
+    with pytest.raises(
+        ProblemError, match=r"reconstruction\.json: the principal point of camera v2 maker 0 lies"
+    ):
         read_problem(path, strict=True)
     assert run([str(path), "--strict", "--output", str(tmp_path / "a.txt")]) == 2
     assert not (tmp_path / "a.txt").exists()
@@ -96,7 +123,8 @@ def test_a_file_is_recognised_by_its_first_bytes_where_the_name_says_nothing(tmp
 
 
 @pytest.mark.parametrize(
-    "content", [b"\x89HDF\r\n", b"ply\nformat ascii 1.0\n", b"<xml/>", b"cameras 3\n", bytes(range(256))]
+    "content",
+    [b"\x89HDF\r\n", b"ply\nformat ascii 1.0\n", b"<xml/>", b"cameras 3\n", bytes(range(256))],
 )
 def test_what_is_not_read_names_what_is(tmp_path, content):
     path = tmp_path / "a.bin"
@@ -118,17 +146,33 @@ def _tar(mode):
 
 OTHERS = [
     ("cameras.bin", lambda: bytes(64), "give the folder that holds it, "),
-    ("points3D.txt", lambda: b"# 3D point list with one line of data per point:\n", "give the folder of the model"),
-    ("renamed.txt", lambda: b"# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a\n", "a COLMAP model"),
+    (
+        "points3D.txt",
+        lambda: b"# 3D point list with one line of data per point:\n",
+        "give the folder of the model",
+    ),
+    (
+        "renamed.txt",
+        lambda: b"# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a\n",
+        "a COLMAP model",
+    ),
     ("database.db", lambda: b"SQLite format 3\0" + bytes(100), "a COLMAP data base (SQLite)"),
     ("renamed.out", lambda: b"SQLite format 3\0" + bytes(100), "a COLMAP data base (SQLite)"),
     ("a.zip", lambda: b"PK\x03\x04" + bytes(40), "an archive: unpack it"),
     ("a.tar", lambda: _tar("w"), "an archive: unpack it"),
     ("a.tar.gz", lambda: _tar("w:gz"), "an archive: unpack it"),
     ("a.tgz", lambda: _tar("w:gz"), "an archive: unpack it"),
-    ("transforms.json", lambda: b'{"fl_x": 1, "frames": [{"transform_matrix": []}]}', "nerfstudio's transforms.json"),
+    (
+        "transforms.json",
+        lambda: b'{"fl_x": 1, "frames": [{"transform_matrix": []}]}',
+        "nerfstudio's transforms.json",
+    ),
     ("a.npz", lambda: b"PK\x03\x04" + bytes(40), "an archive"),
-    ("000000.png", lambda: b"\x89PNG\r\n\x1a\n" + bytes(40), "a binary file of no format that is known here; read are"),
+    (
+        "000000.png",
+        lambda: b"\x89PNG\r\n\x1a\n" + bytes(40),
+        "a binary file of no format that is known here; read are",
+    ),
     (
         "problem.html",
         lambda: b"<!DOCTYPE html>\n<html></html>",
@@ -138,7 +182,9 @@ OTHERS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "content", "message"), OTHERS, ids=[name for name, _, _ in OTHERS])
+@pytest.mark.parametrize(
+    ("name", "content", "message"), OTHERS, ids=[name for name, _, _ in OTHERS]
+)
 def test_a_file_of_another_program_is_named_for_what_it_is(name, content, message, tmp_path):
     path = tmp_path / name
     path.write_bytes(content())
@@ -152,7 +198,9 @@ def test_a_file_of_another_program_is_named_for_what_it_is(name, content, messag
 
 def test_a_file_of_a_model_names_the_folder_to_give(tmp_path):
     write_colmap(support.tiny(), tmp_path / "model")
-    with pytest.raises(ProblemError, match=r"a file of a COLMAP model: give the folder that holds it, .*model$"):
+    with pytest.raises(
+        ProblemError, match=r"a file of a COLMAP model: give the folder that holds it, .*model$"
+    ):
         read_problem(tmp_path / "model" / "images.bin")
 
 

@@ -1,4 +1,5 @@
-"""Whatever the bytes of a file are: a valid problem or a `ProblemError` of one line, and nothing else."""
+"""Whatever the bytes of a file are: a valid problem or a `ProblemError` of one line, and nothing
+else."""
 
 from __future__ import annotations
 
@@ -19,15 +20,25 @@ from hypothesis import strategies as st
 from jaxba.io import ProblemWarning, read_problem, write_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
-BAL = b"2 3 4\n0 0 1.5 -2.5\n1 0 3.25 4e0\n0 1 -5 6\n1 2 .5 7.\n" + b"".join(b"%d.25\n" % i for i in range(27))
-CAMERAS = (
-    b"500.0 -0.1 0.01\n1 0 0\n0 1 0\n0 0 1\n0.1 0.2 0.3\n600 0 0\n0 -1 0\n1 0 0\n0 0 1\n0.4 0.5 0.6\n0 0 0\n"
-    + 4 * b"0 0 0\n"
+BAL = b"2 3 4\n0 0 1.5 -2.5\n1 0 3.25 4e0\n0 1 -5 6\n1 2 .5 7.\n" + b"".join(
+    b"%d.25\n" % i for i in range(27)
 )
-POINTS = b"1.0 2.0 -3.0\n255 0 7\n2 0 11 10.5 -20.5 1 12 30.5 40.5\n4.0 5.0 -6.0\n0 0 0\n1 1 13 -1.5 1e1\n"
+CAMERAS = (
+    b"500.0 -0.1 0.01\n1 0 0\n0 1 0\n0 0 1\n0.1 0.2 0.3\n"
+    b"600 0 0\n0 -1 0\n1 0 0\n0 0 1\n0.4 0.5 0.6\n0 0 0\n" + 4 * b"0 0 0\n"
+)
+POINTS = (
+    b"1.0 2.0 -3.0\n255 0 7\n2 0 11 10.5 -20.5 1 12 30.5 40.5\n"
+    b"4.0 5.0 -6.0\n0 0 0\n1 1 13 -1.5 1e1\n"
+)
 BUNDLER = b"# Bundle file v0.3\n3 2\n" + CAMERAS + POINTS
 SEEDS = {"a.txt": BAL, "a.out": BUNDLER}
-PACKERS = {"": bytes, ".bz2": bz2.compress, ".gz": lambda data: gzip.compress(data, mtime=0), ".xz": lzma.compress}
+PACKERS = {
+    "": bytes,
+    ".bz2": bz2.compress,
+    ".gz": lambda data: gzip.compress(data, mtime=0),
+    ".xz": lzma.compress,
+}
 WORDS = [
     b"nan",
     b"-inf",
@@ -59,7 +70,9 @@ WORDS += [
     b"9" * 400,
 ]
 
-fuzz = settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+fuzz = settings(
+    deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 @st.composite
@@ -67,15 +80,23 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
     """The content after one to four flips, cuts, insertions, removals or exchanges of words."""
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, max(0, len(content) - 1)))
-        kind = draw(st.sampled_from(["flip", "cut", "insert", "remove", "replace word", "swap words", "double"]))
+        kind = draw(
+            st.sampled_from(
+                ["flip", "cut", "insert", "remove", "replace word", "swap words", "double"]
+            )
+        )
         words = content.split(b" ")
         word = draw(st.integers(0, len(words) - 1))
         if kind == "flip" and content:
-            content = content[:at] + bytes([content[at] ^ draw(st.integers(1, 255))]) + content[at + 1 :]
+            content = (
+                content[:at] + bytes([content[at] ^ draw(st.integers(1, 255))]) + content[at + 1 :]
+            )
         elif kind == "cut":
             content = content[:at]
         elif kind == "insert":
-            content = content[:at] + draw(st.sampled_from(WORDS) | st.binary(max_size=8)) + content[at:]
+            content = (
+                content[:at] + draw(st.sampled_from(WORDS) | st.binary(max_size=8)) + content[at:]
+            )
         elif kind == "remove":
             content = content[:at] + content[at + draw(st.integers(1, 20)) :]
         elif kind == "replace word":
@@ -91,7 +112,8 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
 
 
 def check(path: Path, content: bytes) -> None:
-    """Reads the content from the path: a valid problem, which also round-trips, or a `ProblemError` of one line."""
+    """Reads the content from the path: a valid problem, which also round-trips, or a `ProblemError`
+    of one line."""
     path.write_bytes(content)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -106,7 +128,13 @@ def check(path: Path, content: bytes) -> None:
             assert complaint.isprintable()
             assert path.name in complaint
             return
-        arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
+        arrays = (
+            problem.cameras,
+            problem.points,
+            problem.observations,
+            problem.camera_index,
+            problem.point_index,
+        )
         again = BundleProblem.create(*arrays)
         copy = path.with_name("copy.txt")
         write_problem(again, copy)
@@ -139,7 +167,9 @@ def test_damaged_text_under_compression_is_refused_or_still_a_problem(tmp_path, 
 
 def foreign_seed(folder: Path, model: str = "brown") -> Path:
     """A file of OpenSfM; tracks are beside it."""
-    return write_opensfm(folder, Scene([Lens(radial=(-0.1, 0.02, 0.01))], [0, 0, 0]), [model], version=1)
+    return write_opensfm(
+        folder, Scene([Lens(radial=(-0.1, 0.02, 0.01))], [0, 0, 0]), [model], version=1
+    )
 
 
 WRONG = [None, True, 0, -1, 1.5, 1e308, 1e200, 1e-300, 10**30]
@@ -149,14 +179,18 @@ WRONG += [[], {}, [[]], [1], {"key": 0}, [0, 0], [1.0, 2.0, 3.0], 2**31, 2**32 -
 
 @st.composite
 def mutated(draw: st.DrawFn, value: object) -> object:
-    """A JSON document after one to three replacements, removals or doublings of values at any depth."""
+    """A JSON document after one to three replacements, removals or doublings of values at any
+    depth."""
     value = json.loads(json.dumps(value))
     for _ in range(draw(st.integers(1, 3))):
         above, key, here = None, None, value
         for _ in range(draw(st.integers(1, 9))):
             if not (isinstance(here, (dict, list)) and here):
                 break
-            above, key = here, draw(st.sampled_from(list(here) if isinstance(here, dict) else range(len(here))))
+            above, key = (
+                here,
+                draw(st.sampled_from(list(here) if isinstance(here, dict) else range(len(here)))),
+            )
             here = above[key]
         if above is None:
             continue
@@ -174,7 +208,8 @@ def mutated(draw: st.DrawFn, value: object) -> object:
 
 
 def check_foreign(path: Path) -> None:
-    """A valid problem of finite numbers or a `ProblemError` of one line, and no warning but those of readers."""
+    """A valid problem of finite numbers or a `ProblemError` of one line, and no warning but those
+    of readers."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ProblemWarning)
@@ -188,7 +223,10 @@ def check_foreign(path: Path) -> None:
         assert complaint.isprintable()
         assert str(path.parent) in complaint
         return
-    assert all(np.isfinite(np.asarray(part)).all() for part in (problem.cameras, problem.points, problem.observations))
+    assert all(
+        np.isfinite(np.asarray(part)).all()
+        for part in (problem.cameras, problem.points, problem.observations)
+    )
     assert problem.whitening is None or np.isfinite(np.asarray(problem.whitening)).all()
 
 
@@ -222,7 +260,8 @@ def test_random_bytes_are_refused(tmp_path, content, name):
 
 @fuzz
 @given(
-    gaps=st.lists(st.text(" \t\n\r\v\f", min_size=1, max_size=4), min_size=46, max_size=46), block=st.integers(1, 99)
+    gaps=st.lists(st.text(" \t\n\r\v\f", min_size=1, max_size=4), min_size=46, max_size=46),
+    block=st.integers(1, 99),
 )
 def test_any_layout_of_whitespace_reads_the_same(tmp_path, monkeypatch, gaps, block):
     monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", block)
@@ -245,4 +284,7 @@ def test_every_finite_number_round_trips_bit_by_bit(tmp_path, values):
     write_problem(problem, tmp_path / "a.txt")
     found = read_problem(tmp_path / "a.txt")
     for name in ("cameras", "points", "observations"):
-        assert np.asarray(getattr(found, name)).tobytes() == np.asarray(getattr(problem, name)).tobytes()
+        assert (
+            np.asarray(getattr(found, name)).tobytes()
+            == np.asarray(getattr(problem, name)).tobytes()
+        )

@@ -1,4 +1,5 @@
-"""nerfstudio's cameras: points that OpenGL's camera and OpenCV's distortion project are at the problem's pixels."""
+"""nerfstudio's cameras: points that OpenGL's camera and OpenCV's distortion project are at the
+problem's pixels."""
 
 from __future__ import annotations
 
@@ -31,9 +32,12 @@ def pixels_of(document: dict, points: np.ndarray) -> dict[str, np.ndarray]:
     found = {}
     for frame in document["frames"]:
         lens = document | frame
-        local = np.linalg.inv(frame["transform_matrix"]) @ np.vstack([points.T, np.ones(len(points))])
+        local = np.linalg.inv(frame["transform_matrix"]) @ np.vstack(
+            [points.T, np.ones(len(points))]
+        )
         matrix = np.array([[lens["fl_x"], 0, lens["cx"]], [0, lens["fl_y"], lens["cy"]], [0, 0, 1]])
-        ahead, none = local[:3].T * [1, -1, -1], np.zeros(3)  # OpenCV's camera looks along z, with y down
+        # OpenCV's camera looks along z, with y down
+        ahead, none = local[:3].T * [1, -1, -1], np.zeros(3)
         if document["camera_model"] == "OPENCV_FISHEYE":
             radial = np.array([lens.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)])
             pixels, _ = cv2.fisheye.projectPoints(ahead[None], none, none, matrix, radial)
@@ -65,7 +69,9 @@ def test_points_are_at_the_pixels_of_the_problem(kind, tmp_path):
     moved = jaxba.perturb(read_colmap(folder), seed=1, rotation_sigma=0.01, translation_sigma=0.1)
     write_transforms(moved, tmp_path / "transforms.json", like=folder)
     jaxba.write_colmap(moved, tmp_path / "moved", like=folder)
-    document = check(tmp_path / "transforms.json", read_colmap(tmp_path / "moved", refine_principal_point=True))
+    document = check(
+        tmp_path / "transforms.json", read_colmap(tmp_path / "moved", refine_principal_point=True)
+    )
     assert (document["w"], document["h"]) == (1280, 960)
     assert "fl_x" not in document["frames"][0]
 
@@ -101,15 +107,22 @@ def test_the_command_writes_the_cameras_of_a_model(tmp_path, capsys):
     [
         (["7 FOV 1280 960 700 700 640 480 0.1"], "nerfstudio has no camera model FOV"),
         (
-            ["7 OPENCV_FISHEYE 1280 960 700 700 640 480 0 0 0 0", "8 SIMPLE_PINHOLE 800 600 500 400 300"],
+            [
+                "7 OPENCV_FISHEYE 1280 960 700 700 640 480 0 0 0 0",
+                "8 SIMPLE_PINHOLE 800 600 500 400 300",
+            ],
             "nerfstudio has one camera model in a file, not OPENCV_FISHEYE, SIMPLE_PINHOLE",
         ),
     ],
 )
-def test_lenses_that_it_does_not_have_are_refused_before_the_solve(lines, message, tmp_path, capsys):
+def test_lenses_that_it_does_not_have_are_refused_before_the_solve(
+    lines, message, tmp_path, capsys
+):
     model = TextModel()
     model.cameras[1:] = lines
-    model.heads[2] = model.heads[2].replace(" 7 view", " 8 view") if len(lines) > 1 else model.heads[2]
+    model.heads[2] = (
+        model.heads[2].replace(" 7 view", " 8 view") if len(lines) > 1 else model.heads[2]
+    )
     file = tmp_path / "transforms.json"
     assert run([str(model.write(tmp_path / "model")), "--output", str(file)]) == 2
     assert capsys.readouterr().err == f"error: cannot write {file}: {message}\n"

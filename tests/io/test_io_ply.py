@@ -17,11 +17,14 @@ def make_problem(num_cameras: int = 6, num_points: int = 30) -> BundleProblem:
     rng = np.random.default_rng(0)
     cameras = rng.normal(size=(num_cameras, 9))
     cameras[0, :3] = 0
-    return BundleProblem.create(cameras, 1e5 * rng.normal(size=(num_points, 3)), [[1.0, 2.0]], [0], [0])
+    return BundleProblem.create(
+        cameras, 1e5 * rng.normal(size=(num_points, 3)), [[1.0, 2.0]], [0], [0]
+    )
 
 
 def parse_ply(content: bytes) -> np.ndarray:
-    """Vertices of a PLY file with the properties x, y, z (double) and three colours (uchar): shape (n, 6)."""
+    """Vertices of a PLY file with the properties x, y, z (double) and three colours (uchar): shape
+    (n, 6)."""
     header, body = content.split(b"end_header\n", 1)
     magic, form, *rest = header.decode("ascii").splitlines()
     assert magic == "ply"
@@ -67,7 +70,9 @@ def test_the_suffix_chooses_the_format(tmp_path):
     write_problem(problem, tmp_path / "a.ply.gz")
     write_problem(problem, tmp_path / "a.txt")
     assert parse_ply((tmp_path / "a.PLY").read_bytes()).shape == (36, 6)
-    assert gzip.decompress((tmp_path / "a.ply.gz").read_bytes()) == (tmp_path / "a.PLY").read_bytes()
+    assert (
+        gzip.decompress((tmp_path / "a.ply.gz").read_bytes()) == (tmp_path / "a.PLY").read_bytes()
+    )
     assert (tmp_path / "a.txt").read_text().startswith("6 30 1\n")
 
 

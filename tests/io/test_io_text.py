@@ -1,4 +1,5 @@
-"""Text as other programs and editors write it, in every text reader; and what is implausible in it."""
+"""Text as other programs and editors write it, in every text reader; and what is implausible in
+it."""
 
 from __future__ import annotations
 
@@ -55,7 +56,9 @@ def test_byte_order_marks_change_nothing(file, monkeypatch, encoding, block):
 
 @pytest.mark.parametrize("block", [7, 1 << 20])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_layout_of_lines_and_the_letter_of_exponents_change_nothing(file, monkeypatch, layout, block):
+def test_the_layout_of_lines_and_the_letter_of_exponents_change_nothing(
+    file, monkeypatch, layout, block
+):
     expected = read_problem(file)
     text = file.read_text()
     assert layout != "Fortran" or "e-" in text
@@ -64,7 +67,9 @@ def test_the_layout_of_lines_and_the_letter_of_exponents_change_nothing(file, mo
     same(read_problem(file), expected)
 
 
-@pytest.mark.parametrize("ending", [".TXT", ".Bal", ".OUT", ".TXT.BZ2", ".out.GZ", ".Out.Xz", "", ".5"])
+@pytest.mark.parametrize(
+    "ending", [".TXT", ".Bal", ".OUT", ".TXT.BZ2", ".out.GZ", ".Out.Xz", "", ".5"]
+)
 def test_endings_in_upper_case_are_those_in_lower_case(tmp_path, ending):
     write_problem(support.tiny(), tmp_path / f"a{ending}")
     data = (tmp_path / f"a{ending}").read_bytes()
@@ -75,7 +80,8 @@ def test_endings_in_upper_case_are_those_in_lower_case(tmp_path, ending):
 
 
 @pytest.mark.parametrize(
-    "word", ["nan", "-nan", "-nan(ind)", "nan(0x1)", "1.#QNAN", "-1.#IND00", "1.#INF", "+Infinity", "inf"]
+    "word",
+    ["nan", "-nan", "-nan(ind)", "nan(0x1)", "1.#QNAN", "-1.#IND00", "1.#INF", "+Infinity", "inf"],
 )
 def test_numbers_that_are_not_finite_are_known_as_such_in_every_spelling(file, word):
     for at in (-1, 20):
@@ -94,7 +100,22 @@ def test_numbers_that_are_not_finite_are_known_as_such_in_every_spelling(file, w
 
 
 @pytest.mark.parametrize(
-    "word", ["", "1_0", "0x10", "1,5", "\u0663", "1d", "d5", "1.#", "1.#QNANX", "nanx", "na", "--1", "1e5e5"]
+    "word",
+    [
+        "",
+        "1_0",
+        "0x10",
+        "1,5",
+        "\u0663",
+        "1d",
+        "d5",
+        "1.#",
+        "1.#QNANX",
+        "nanx",
+        "na",
+        "--1",
+        "1e5e5",
+    ],
 )
 def test_other_words_are_no_numbers(word):
     with pytest.raises(ValueError, match="is no number"):
@@ -123,9 +144,13 @@ def test_a_written_bundler_model_is_the_same_problem(tmp_path):
     found = read_problem(tmp_path / "a.out")
     order = np.argsort(problem.point_index, kind="stable")
     for name in ("observations", "camera_index", "point_index"):
-        np.testing.assert_array_equal(getattr(found, name), np.asarray(getattr(problem, name))[order])
+        np.testing.assert_array_equal(
+            getattr(found, name), np.asarray(getattr(problem, name))[order]
+        )
     np.testing.assert_array_equal(found.points, problem.points)
-    np.testing.assert_array_equal(np.asarray(found.cameras)[:, 3:], np.asarray(problem.cameras)[:, 3:])
+    np.testing.assert_array_equal(
+        np.asarray(found.cameras)[:, 3:], np.asarray(problem.cameras)[:, 3:]
+    )
     np.testing.assert_allclose(found.cameras, problem.cameras, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(geometry.cost(found), geometry.cost(problem), rtol=1e-11)
 
@@ -133,12 +158,16 @@ def test_a_written_bundler_model_is_the_same_problem(tmp_path):
 def test_a_written_bundler_model_follows_the_manual(tmp_path):
     """Lines as the manual of Bundler describes them; a camera turned by 90 degrees about z."""
     camera = [0, 0, np.pi / 2, 1, 2, 3, 500, -0.1, 0.01]
-    problem = BundleProblem.create([camera], [[4, 5, -6], [7, 8, -9]], [[1.5, -2], [3, 4]], [0, 0], [1, 0])
+    problem = BundleProblem.create(
+        [camera], [[4, 5, -6], [7, 8, -9]], [[1.5, -2], [3, 4]], [0, 0], [1, 0]
+    )
     write_bundler(problem, tmp_path / "a.out")
     lines = (tmp_path / "a.out").read_text().splitlines()
     assert lines[:3] == ["# Bundle file v0.3", "1 2", "500.0 -0.1 0.01"]
     np.testing.assert_allclose(
-        [list(map(float, row.split())) for row in lines[3:6]], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15
+        [list(map(float, row.split())) for row in lines[3:6]],
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+        atol=1e-15,
     )
     assert lines[6:10] == ["1.0 2.0 3.0", "4.0 5.0 -6.0", "192 192 192", "1 0 1 3.0 4.0"]
     assert lines[10:] == ["7.0 8.0 -9.0", "192 192 192", "1 0 0 1.5 -2.0"]
@@ -163,7 +192,8 @@ def test_pixels_from_a_corner_are_noted(tmp_path, ending, flip):
     shifted = (pixels - pixels.min(axis=0)) * [1, flip]
     write_problem(problem.replace(observations=shifted), tmp_path / f"a{ending}")
     with pytest.warns(
-        ProblemWarning, match=rf"a{ending}: pixels seem to be measured from a corner of the image \(x in 0"
+        ProblemWarning,
+        match=rf"a{ending}: pixels seem to be measured from a corner of the image \(x in 0",
     ):
         read_problem(tmp_path / f"a{ending}")
 

@@ -10,15 +10,38 @@ from jaxba.problem.bundle_problem import ProblemError
 from jaxba.solver.record import Record, TracePoint
 
 CONTRACT_KEYS = [
-    *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
-    *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
+    *(
+        "problem",
+        "family",
+        "cameras",
+        "points",
+        "observations",
+        "solver",
+        "backend",
+        "device",
+        "dtype",
+        "threads",
+    ),
+    *(
+        "repeat",
+        "setup_s",
+        "compile_s",
+        "total_s",
+        "initial_cost",
+        "final_cost",
+        "iterations",
+        "accepted",
+    ),
     *("cg_iterations", "termination", "trace", "notes"),
 ]
 TRACE_KEYS = ["iteration", "time_s", "cost", "lambda", "accepted", "cg_iterations", "gain_ratio"]
 
 
 def make_record(repeat=0, problem="ladybug"):
-    trace = (TracePoint(0, 0.0, 8.0, math.nan, True, 0, math.nan), TracePoint(1, 0.5, 2.0, 1e-4, True, 3, 0.75))
+    trace = (
+        TracePoint(0, 0.0, 8.0, math.nan, True, 0, math.nan),
+        TracePoint(1, 0.5, 2.0, 1e-4, True, 3, 0.75),
+    )
     sizes = (problem, "bal", 2, 3, 4, "ceres", "jax", "cpu", "float64", 2, repeat)
     return Record(*sizes, 0.1, 1.5, 2.1, 8.0, 2.0, 1, 1, 3, "ftol", trace)
 
@@ -93,7 +116,8 @@ def test_appending_after_a_cut_leaves_a_readable_file(tmp_path):
     path.write_bytes(whole[:-1])  # only the newline is lost: the record stays
     json_lines.append(path, make_record(3))
     assert [r.repeat for r in json_lines.read(path, Record)] == [0, 3]
-    path.write_bytes(whole[:50])  # nothing but a half line, and one longer than a block of the search
+    # nothing but a half line, and one longer than a block of the search
+    path.write_bytes(whole[:50])
     json_lines.append(path, make_record(4))
     assert [r.repeat for r in json_lines.read(path, Record)] == [4]
     path.write_bytes(whole + b'{"x": "' + b"y" * 200_000)
@@ -102,7 +126,14 @@ def test_appending_after_a_cut_leaves_a_readable_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "bad", ['{"problem": "a"', "[]", '{"problem": "a"}', '{"problem": "a", "problem": "b"}', "\u00ff\u00fe"]
+    "bad",
+    [
+        '{"problem": "a"',
+        "[]",
+        '{"problem": "a"}',
+        '{"problem": "a", "problem": "b"}',
+        "\u00ff\u00fe",
+    ],
 )
 def test_malformed_line_elsewhere_is_one_clear_error(tmp_path, bad):
     path = tmp_path / "results.jsonl"

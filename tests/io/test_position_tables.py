@@ -17,9 +17,24 @@ DEGREES = [[8.5, 47.25, 500.0], [8.5625, 47.3125, 620.5]]
 
 FORMS = {
     "geo.txt of a projected system": ("WGS84 UTM 33N", "{0} {x} {y} {z}", "EPSG:32633", None),
-    "geo.txt with angles": ("EPSG:32633", "{0} {x} {y} {z} 12.0 -90 0 0.25 0.5", "EPSG:32633", (0.25, 0.25, 0.5)),
-    "geo.txt between tabs": ("EPSG:32633", "{0}\t{x}\t{y}\t{z}\t0.25\t0.5", "EPSG:32633", (0.25, 0.25, 0.5)),
-    "geo.txt of PROJ": ("+proj=utm +zone=33\n# name x y z\n", "{0} {x} {y} {z}", "+proj=utm +zone=33", None),
+    "geo.txt with angles": (
+        "EPSG:32633",
+        "{0} {x} {y} {z} 12.0 -90 0 0.25 0.5",
+        "EPSG:32633",
+        (0.25, 0.25, 0.5),
+    ),
+    "geo.txt between tabs": (
+        "EPSG:32633",
+        "{0}\t{x}\t{y}\t{z}\t0.25\t0.5",
+        "EPSG:32633",
+        (0.25, 0.25, 0.5),
+    ),
+    "geo.txt of PROJ": (
+        "+proj=utm +zone=33\n# name x y z\n",
+        "{0} {x} {y} {z}",
+        "+proj=utm +zone=33",
+        None,
+    ),
     "geo.txt between commas": ("EPSG:32633", "{0}, {x}, {y}, {z}", "EPSG:32633", None),
     "Metashape": (
         '#CoordinateSystem: PROJCS["WGS 84 / UTM zone 33N"]\n'
@@ -28,11 +43,22 @@ FORMS = {
         'PROJCS["WGS 84 / UTM zone 33N"]',
         (0.25, 0.25, 0.5),
     ),
-    "a spreadsheet": ("Image;X;Y;Z;Accuracy [cm]", "{0};{cx};{cy};{cz};25,0", "", (0.25, 0.25, 0.25)),
+    "a spreadsheet": (
+        "Image;X;Y;Z;Accuracy [cm]",
+        "{0};{cx};{cy};{cz};25,0",
+        "",
+        (0.25, 0.25, 0.25),
+    ),
     "quoted decimal commas": ('Label,"X","Y","Z"', '"{0}","{cx}","{cy}","{cz}"', "", None),
-    "blanks between names": ("image x y z sigma_x sigma_y sigma_z", "{0} {x} {y} {z} 1 2 3", "", (1, 2, 3)),
+    "blanks between names": (
+        "image x y z sigma_x sigma_y sigma_z",
+        "{0} {x} {y} {z} 1 2 3",
+        "",
+        (1, 2, 3),
+    ),
 }
-"""What a file begins with, a line of values, and the coordinate system and standard deviations that it says."""
+"""What a file begins with, a line of values, and the coordinate system and standard deviations that
+it says."""
 
 
 def line_of(form: str, name: str, place: list[float]) -> str:
@@ -46,7 +72,12 @@ def line_of(form: str, name: str, place: list[float]) -> str:
 def test_tables_of_other_programs_are_read(form, encoding, tmp_path):
     first, line, crs, deviations = FORMS[form]
     names = ["IMG 1.JPG", "IMG 2.JPG"]
-    lines = [first, *(line_of(line, name, place) for name, place in zip(names, UTM, strict=True)), "", "#end"]
+    lines = [
+        first,
+        *(line_of(line, name, place) for name, place in zip(names, UTM, strict=True)),
+        "",
+        "#end",
+    ]
     (tmp_path / "log.csv").write_bytes("\r\n".join(lines).encode(encoding))
     found = read_table(tmp_path / "log.csv")
     assert (found.names, found.crs, found.notes) == (names, crs, ())
@@ -55,11 +86,14 @@ def test_tables_of_other_programs_are_read(form, encoding, tmp_path):
         assert found.covariances is None
     else:
         assert found.covariances is not None
-        np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2)), [deviations] * 2)
+        np.testing.assert_allclose(
+            np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2)), [deviations] * 2
+        )
 
 
 def test_a_table_of_degrees_without_names_of_columns_has_latitude_first(tmp_path):
-    """As Pix4D writes it; with a coordinate system before it is OpenDroneMap's, with longitude first."""
+    """As Pix4D writes it; with a coordinate system before it is OpenDroneMap's, with longitude
+    first."""
     lines = [f"IMG{at}.JPG,{47.25 + 1e-4 * at},{8.5 + 1e-4 * at},500,1,2,3" for at in range(3)]
     (tmp_path / "log.csv").write_text("\n".join(lines))
     found = read_table(tmp_path / "log.csv")
@@ -67,7 +101,8 @@ def test_a_table_of_degrees_without_names_of_columns_has_latitude_first(tmp_path
     (tmp_path / "log.csv").write_text("\n".join(["EPSG:4326", *lines]))
     assert read_table(tmp_path / "log.csv").places[0].tolist() == [47.25, 8.5, 500.0]
     (tmp_path / "log.csv").write_text("a.jpg,1,2,3\nb.jpg,4,5,6\nc.jpg,7,8,9\n")
-    with pytest.raises(ProblemError, match="no line names the columns"):  # degrees, or metres of a scene
+    # degrees, or metres of a scene
+    with pytest.raises(ProblemError, match="no line names the columns"):
         read_table(tmp_path / "log.csv")
 
 
@@ -77,7 +112,10 @@ def test_a_table_of_degrees_without_names_of_columns_has_latitude_first(tmp_path
         ("x [m],y [m],altitude (ft)", (1.0, 0.3048)),
         ("easting_m,northing_m,height [US survey feet]", (1.0, 1200 / 3937)),
         ("x,y,z", (np.nan, np.nan)),
-        ("latitude [decimal degrees],longitude [decimal degrees],altitude [meter] (WGS84)", (1.0, 1.0)),
+        (
+            "latitude [decimal degrees],longitude [decimal degrees],altitude [meter] (WGS84)",
+            (1.0, 1.0),
+        ),
     ],
 )
 def test_units_are_those_of_the_names_of_columns(title, units, tmp_path):
@@ -88,14 +126,54 @@ def test_units_are_those_of_the_names_of_columns(title, units, tmp_path):
 @pytest.mark.parametrize(
     ("columns", "cells", "deviations", "note"),
     [
-        ("accuracy", ["0.1", "", "0.3"], [[0.1] * 3, [0.3] * 3, [0.3] * 3], "no accuracy of 1 image, .*: b.jpg$"),
-        ("accuracy", ["0.1", "0", "-1"], [[0.1] * 3] * 3, "no accuracy of 2 images, .* others: b.jpg, c.jpg$"),
-        ("hacc,vacc", ["1,4", "2,", ",5"], [[1, 1, 4], [2, 2, 5], [2, 2, 5]], "no accuracy of 2 images"),
-        ("accuracy_horizontal", ["1", "2", "3"], [[1, 1, 2], [2, 2, 4], [3, 3, 6]], "they get 2 times the horizontal"),
-        ("accuracy_vertical", ["1", "2", "3"], [[1] * 3, [2] * 3, [3] * 3], "positions get that of heights"),
-        ("accuracy class", ["1", "2", "3"], None, "accuracies in column accuracy class are not used: .* is 1$"),
-        ("sigma lat [deg]", ["1", "2", "3"], None, r"accuracies in column sigma lat \[deg\] are not used: .* is 1$"),
-        ("accuracy", ["fixed", "float", ""], None, "accuracies in column accuracy are not used: .* is 1$"),
+        (
+            "accuracy",
+            ["0.1", "", "0.3"],
+            [[0.1] * 3, [0.3] * 3, [0.3] * 3],
+            "no accuracy of 1 image, .*: b.jpg$",
+        ),
+        (
+            "accuracy",
+            ["0.1", "0", "-1"],
+            [[0.1] * 3] * 3,
+            "no accuracy of 2 images, .* others: b.jpg, c.jpg$",
+        ),
+        (
+            "hacc,vacc",
+            ["1,4", "2,", ",5"],
+            [[1, 1, 4], [2, 2, 5], [2, 2, 5]],
+            "no accuracy of 2 images",
+        ),
+        (
+            "accuracy_horizontal",
+            ["1", "2", "3"],
+            [[1, 1, 2], [2, 2, 4], [3, 3, 6]],
+            "they get 2 times the horizontal",
+        ),
+        (
+            "accuracy_vertical",
+            ["1", "2", "3"],
+            [[1] * 3, [2] * 3, [3] * 3],
+            "positions get that of heights",
+        ),
+        (
+            "accuracy class",
+            ["1", "2", "3"],
+            None,
+            "accuracies in column accuracy class are not used: .* is 1$",
+        ),
+        (
+            "sigma lat [deg]",
+            ["1", "2", "3"],
+            None,
+            r"accuracies in column sigma lat \[deg\] are not used: .* is 1$",
+        ),
+        (
+            "accuracy",
+            ["fixed", "float", ""],
+            None,
+            "accuracies in column accuracy are not used: .* is 1$",
+        ),
     ],
 )
 def test_what_a_table_lacks_of_accuracies_is_said(columns, cells, deviations, note, tmp_path):
@@ -108,7 +186,9 @@ def test_what_a_table_lacks_of_accuracies_is_said(columns, cells, deviations, no
     if deviations is None:
         assert found.covariances is None
     else:
-        np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2)), deviations)
+        np.testing.assert_allclose(
+            np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2)), deviations
+        )
 
 
 @pytest.mark.parametrize(
@@ -136,14 +216,26 @@ def test_coordinates_of_exiftool_and_a_spreadsheet_in_the_encoding_of_windows_ar
         "./b.jpg,47.25 N,8.5 W,12.5 m",
     ]
     (tmp_path / "log.csv").write_text("\n".join(lines))
-    assert read_table(tmp_path / "log.csv").places.tolist() == [[8.5, -47.25, -12.5], [-8.5, 47.25, 12.5]]
-    (tmp_path / "log.csv").write_bytes("Bild;Rechtswert;Hochwert;Höhe\nä.jpg;1,5;2,5;3,5\n".encode("cp1252"))
+    assert read_table(tmp_path / "log.csv").places.tolist() == [
+        [8.5, -47.25, -12.5],
+        [-8.5, 47.25, 12.5],
+    ]
+    (tmp_path / "log.csv").write_bytes(
+        "Bild;Rechtswert;Hochwert;Höhe\nä.jpg;1,5;2,5;3,5\n".encode("cp1252")
+    )
     found = read_table(tmp_path / "log.csv")
     assert (found.names, found.places.tolist()) == (["ä.jpg"], [[1.5, 2.5, 3.5]])
 
 
 NO_FIX = {
-    "degrees": [[0, 0, 0], [0, 0, 120.5], [np.nan, 47, 5], [8.5, -9999, 5], [8.5, 95, 5], [8.5, 47, -32768]],
+    "degrees": [
+        [0, 0, 0],
+        [0, 0, 120.5],
+        [np.nan, 47, 5],
+        [8.5, -9999, 5],
+        [8.5, 95, 5],
+        [8.5, 47, -32768],
+    ],
     "metres": [[0, 0, 0], [0, 0, 120.5], [np.nan, 47, 5], [592772, -9999, 5]],
 }
 
@@ -173,7 +265,8 @@ CONTROL = {
 @pytest.mark.parametrize("form", CONTROL)
 def test_control_points_of_other_programs_are_read(form, tmp_path):
     (tmp_path / "gcp_list.txt").write_text(
-        f"WGS84 UTM 33N\nx y z im_x im_y image_name gcp_name\n{line_of(CONTROL[form], '', UTM[0])}\n"
+        "WGS84 UTM 33N\nx y z im_x im_y image_name "
+        f"gcp_name\n{line_of(CONTROL[form], '', UTM[0])}\n"
     )
     found = read_control_points(tmp_path / "gcp_list.txt")
     assert (found.crs, found.names, found.images) == ("EPSG:32633", ["gcp1"], ["IMG 1.JPG"])
@@ -181,7 +274,8 @@ def test_control_points_of_other_programs_are_read(form, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line", ["1 2 4 5 a.JPG g", "1 2 nan 4 5 a.JPG g", "1\t2\t\t4\t5\ta.JPG\tg", "- - - 4 5 a.JPG g"]
+    "line",
+    ["1 2 4 5 a.JPG g", "1 2 nan 4 5 a.JPG g", "1\t2\t\t4\t5\ta.JPG\tg", "- - - 4 5 a.JPG g"],
 )
 def test_control_points_without_height_or_place_have_none(line, tmp_path):
     (tmp_path / "gcp_list.txt").write_text(f"EPSG:32633\n{line}\n")

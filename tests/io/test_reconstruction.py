@@ -20,10 +20,18 @@ pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore::jaxba.Probl
 def scene(rigs=10, cameras=1, frames=1):
     pycolmap.set_random_seed(3)
     options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = rigs, cameras, frames
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
+        rigs,
+        cameras,
+        frames,
+    )
     options.num_points3D = 100
     found = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = 0.5, 0.02, 0.3
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
+        0.5,
+        0.02,
+        0.3,
+    )
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, found)
     return found
@@ -32,7 +40,11 @@ def scene(rigs=10, cameras=1, frames=1):
 def tight(**changes):
     options = pycolmap.BundleAdjustmentOptions()
     ceres = options.ceres.solver_options
-    ceres.function_tolerance, ceres.gradient_tolerance, ceres.parameter_tolerance = 1e-14, 1e-12, 1e-14
+    ceres.function_tolerance, ceres.gradient_tolerance, ceres.parameter_tolerance = (
+        1e-14,
+        1e-12,
+        1e-14,
+    )
     ceres.max_num_iterations, options.print_summary = 300, False
     for name, value in changes.items():
         setattr(options, name, value)
@@ -59,7 +71,9 @@ def test_a_script_changed_in_one_line_ends_alike(shape):
     assert solution.final_cost == pytest.approx(cost(theirs), rel=1e-9)
     assert cost(ours) == pytest.approx(cost(theirs), rel=1e-9)
     ours.update_point_3d_errors()
-    assert ours.compute_mean_reprojection_error() == pytest.approx(theirs.compute_mean_reprojection_error(), rel=1e-6)
+    assert ours.compute_mean_reprojection_error() == pytest.approx(
+        theirs.compute_mean_reprojection_error(), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("refined", ["refine_focal_length", "refine_extra_params"])
@@ -71,7 +85,9 @@ def test_what_options_hold_stays(refined):
     assert cost(ours) == pytest.approx(cost(theirs), rel=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["images", "variable points", "constants", "robust", "short tracks"])
+@pytest.mark.parametrize(
+    "kind", ["images", "variable points", "constants", "robust", "short tracks"]
+)
 def test_local_bundle_adjustment_ends_as_colmaps_does(kind):
     theirs = scene()
     ours, options, config = copy.deepcopy(theirs), tight(), pycolmap.BundleAdjustmentConfig()
@@ -87,7 +103,10 @@ def test_local_bundle_adjustment_ends_as_colmaps_does(kind):
         config.set_constant_rig_from_world_pose(theirs.images[images[0]].frame_id)
         config.set_constant_cam_intrinsics(theirs.images[images[1]].camera_id)
     if kind == "robust":
-        options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 2.0
+        options.ceres.loss_function_type, options.ceres.loss_function_scale = (
+            pycolmap.LossFunctionType.CAUCHY,
+            2.0,
+        )
     if kind == "short tracks":
         options.min_track_length = 10
         theirs.delete_observation(images[0], 0)
@@ -113,7 +132,10 @@ def test_a_part_can_be_written_into_the_whole_model(tmp_path):
     assert cost(written) < cost(model)
     before = pycolmap.Reconstruction(tmp_path / "old")
     for image in sorted(before.images)[4:]:
-        assert (written.images[image].cam_from_world().matrix() == before.images[image].cam_from_world().matrix()).all()
+        assert (
+            written.images[image].cam_from_world().matrix()
+            == before.images[image].cam_from_world().matrix()
+        ).all()
 
 
 def test_what_cannot_be_is_one_line_without_a_temporary_name():
@@ -123,11 +145,14 @@ def test_what_cannot_be_is_one_line_without_a_temporary_name():
     with pytest.raises(jaxba.ProblemError, match=r"^the reconstruction: no image sees a point$"):
         jaxba.from_pycolmap(pycolmap.Reconstruction())
     with pytest.raises(
-        jaxba.ProblemError, match=r"^the reconstruction: no observation is left of what the config means$"
+        jaxba.ProblemError,
+        match=r"^the reconstruction: no observation is left of what the config means$",
     ):
         jaxba.from_pycolmap(model, config)
     config.add_image(77)
-    with pytest.raises(ValueError, match="config names image 77, which the reconstruction does not have"):
+    with pytest.raises(
+        ValueError, match="config names image 77, which the reconstruction does not have"
+    ):
         jaxba.from_pycolmap(model, config)
     solution = jaxba.solve(jaxba.from_pycolmap(model), options=jaxba.SolveOptions(max_iterations=1))
     with pytest.raises(jaxba.ProblemError, match="the problem is not one of this reconstruction"):

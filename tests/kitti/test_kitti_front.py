@@ -1,4 +1,5 @@
-"""From rendered images to a problem: two cameras, three kinds of key-points, and what goes wrong on the way."""
+"""From rendered images to a problem: two cameras, three kinds of key-points, and what goes wrong on
+the way."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ def rendered(tmp_path_factory) -> dict[Camera, Path]:
     """The same drive seen by two cameras of different size and calibration."""
     root = tmp_path_factory.mktemp("kitti")
     poses = kitti_scene.path(FRAMES)
-    return {camera: write_sequence(root / str(camera.width), camera, poses) for camera in (SMALL, OTHER)}
+    return {
+        camera: write_sequence(root / str(camera.width), camera, poses) for camera in (SMALL, OTHER)
+    }
 
 
 @pytest.fixture
@@ -86,7 +89,9 @@ def test_the_epipolar_geometry_separates_wrong_matches_from_right_ones():
 
 def brute_force(a: np.ndarray, b: np.ndarray, ratio: float) -> set[tuple[int, int]]:
     """Mutual nearest neighbours with the ratio test on both sides, by loops."""
-    distance = np.array([[float(np.linalg.norm(x.astype(float) - y)) for y in b.astype(float)] for x in a])
+    distance = np.array(
+        [[float(np.linalg.norm(x.astype(float) - y)) for y in b.astype(float)] for x in a]
+    )
     found = set()
     for i in range(len(a)):
         j = int(distance[i].argmin())
@@ -101,7 +106,9 @@ def brute_force(a: np.ndarray, b: np.ndarray, ratio: float) -> set[tuple[int, in
 def test_matches_are_those_of_a_search_by_loops():
     random = np.random.default_rng(3)
     a = random.integers(0, 60, (30, 128)).astype(np.uint8)
-    b = np.concatenate([a[random.permutation(30)[:20]], random.integers(0, 60, (15, 128)).astype(np.uint8)])
+    b = np.concatenate(
+        [a[random.permutation(30)[:20]], random.integers(0, 60, (15, 128)).astype(np.uint8)]
+    )
     b = np.clip(b.astype(int) + random.integers(-14, 15, b.shape), 0, 255).astype(np.uint8)
     found = match(a.astype(np.float32), b.astype(np.float32))
     assert {tuple(pair) for pair in found.tolist()} == brute_force(a, b, 0.8)
@@ -146,7 +153,9 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     write_problem(exact.replace(cameras=cameras), out)
     assert solve([str(out), "--policy", "ceres", "--output", str(solved)]) == 0
     capsys.readouterr()
-    assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder)]) == 0
+    assert (
+        run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder)]) == 0
+    )
     printed = capsys.readouterr()
     assert printed.err == ""
     found = json.loads((folder / "evaluation.json").read_text())
@@ -165,10 +174,13 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
 
 def test_given_poses_are_the_start(rendered, tmp_path, capsys):
     out = tmp_path / "p.txt"
-    assert build(rendered[SMALL], out, "--start", "poses", "--keyframes", "3", "--frames", "1:14") == 0
+    assert (
+        build(rendered[SMALL], out, "--start", "poses", "--keyframes", "3", "--frames", "1:14") == 0
+    )
     assert start_error(capsys.readouterr().out) < 1e-6
     assert json.loads((tmp_path / "p.frames.json").read_text())["frames"] == [1, 4, 7, 10, 13]
-    assert run(["evaluate", str(out), "--out", str(tmp_path / "e")]) == 0  # no truth: the picture alone
+    # no truth: the picture alone
+    assert run(["evaluate", str(out), "--out", str(tmp_path / "e")]) == 0
     assert "ate_m" not in json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"][0]
 
 
@@ -181,7 +193,10 @@ def test_a_black_frame_is_left_out(sequence, tmp_path, capsys):
     assert build(sequence, out, "--keyframes", "all") == 0
     printed = capsys.readouterr()
     assert "note: left out, too few matches: frame 5\n" in printed.out
-    assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [*range(5), *range(6, FRAMES)]
+    assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [
+        *range(5),
+        *range(6, FRAMES),
+    ]
     assert start_error(printed.out) < 0.1
 
 
@@ -208,7 +223,9 @@ def test_a_car_that_stands_first_is_no_trouble(sequence, tmp_path, capsys, choic
         noise = np.rint(2 * random.standard_normal(still.shape))
         cv2.imwrite(str(image(sequence, number)), np.clip(still + noise, 0, 255).astype(np.uint8))
         poses[number] = poses[4]
-    (sequence / "poses.txt").write_text("".join(" ".join(map(str, pose.ravel())) + "\n" for pose in poses))
+    (sequence / "poses.txt").write_text(
+        "".join(" ".join(map(str, pose.ravel())) + "\n" for pose in poses)
+    )
     assert build(sequence, tmp_path / "p.txt", "--keyframes", choice) == 0
     assert start_error(capsys.readouterr().out) < 0.1
 
@@ -222,7 +239,10 @@ def test_a_camera_that_only_turns_is_refused(sequence, tmp_path, capsys, choice)
         cv2.imwrite(str(image(sequence, number)), render(SMALL, pose, layers))
     assert build(sequence, tmp_path / "p.txt", "--keyframes", choice, "--frames", "0:6") == 2
     message = capsys.readouterr().err
-    assert "hardly moves in frames 0 to 5" in message or "have enough parallax to start from" in message
+    assert (
+        "hardly moves in frames 0 to 5" in message
+        or "have enough parallax to start from" in message
+    )
     assert message.count("\n") == 1
 
 
@@ -244,7 +264,8 @@ def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys
 
 @pytest.mark.parametrize("bits", [12, 16])
 def test_images_of_more_than_eight_bits_are_seen_as_those_of_eight(rendered, sequence, bits):
-    """The highest used bits count, whichever frame is read first, and a brighter frame is no darker than white."""
+    """The highest used bits count, whichever frame is read first, and a brighter frame is no darker
+    than white."""
     for number in range(FRAMES):
         grey = cv2.imread(str(image(sequence, number)), 0)
         grey[0, 0] = 255 if number == 0 else grey[0, 0]
@@ -295,7 +316,9 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (["--min-matches", "3000", "--frames", "0:3"], "at least 3000 are needed"),
     ],
 )
-def test_what_makes_no_sense_is_said_in_one_line(rendered, tmp_path, monkeypatch, capsys, options, words):
+def test_what_makes_no_sense_is_said_in_one_line(
+    rendered, tmp_path, monkeypatch, capsys, options, words
+):
     monkeypatch.chdir(tmp_path)
     assert run([str(rendered[SMALL]), *options]) == 2
     message = capsys.readouterr().err
@@ -364,21 +387,30 @@ def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys):
 @needs_data
 @pytest.mark.slow
 def test_bundle_adjustment_ends_within_a_hundredth_of_the_real_drive_of_the_truth(tmp_path, capsys):
-    """200 frames, 145 m with a right turn, by the three commands of the documentation. Odometry has begun 0.6 to 3.4 m
-    from the truth, by version and machine; the lowest cost, under Ceres too, lies at 1.0 to 1.3 m."""
+    """200 frames, 145 m with a right turn, by the three commands of the documentation. Odometry has
+    begun 0.6 to 3.4 m from the truth, by version and machine; the lowest cost, under Ceres too,
+    lies at 1.0 to 1.3 m."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
-    out, solved, poses = tmp_path / "k.txt.bz2", tmp_path / "s.txt.bz2", str(root / "poses" / "00.txt")
+    out, solved, poses = (
+        tmp_path / "k.txt.bz2",
+        tmp_path / "s.txt.bz2",
+        str(root / "poses" / "00.txt"),
+    )
     assert run([str(root / "seq00"), "--frames", "0:200", "--poses", poses, "--out", str(out)]) == 0
     assert solve([str(out), "--output", str(solved)]) == 0
-    assert run(["evaluate", str(out), str(solved), "--poses", poses, "--out", str(tmp_path / "e")]) == 0
+    assert (
+        run(["evaluate", str(out), str(solved), "--poses", poses, "--out", str(tmp_path / "e")])
+        == 0
+    )
     before, after = json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"]
     assert after["ate_m"]["rmse"] < 0.01 * 144.9
     assert after["rms_px"] < before["rms_px"]
 
 
 def test_the_orientation_that_a_photograph_asks_for_is_not_made(sequence):
-    """Calibration is that of the stored pixels. The segment is EXIF's with one tag: orientation 6, a quarter turn."""
+    """Calibration is that of the stored pixels. The segment is EXIF's with one tag: orientation 6,
+    a quarter turn."""
     tag = b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"
     exif = b"Exif\x00\x00MM\x00\x2a\x00\x00\x00\x08\x00\x01" + tag + bytes(4)
     segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
@@ -405,11 +437,16 @@ def test_a_principal_point_at_the_edge_of_the_image_is_noted(sequence, tmp_path,
     calibration.write_text("P0: 210 0 0 0 0 210 0 0 0 0 1 0\n")
     build(sequence, tmp_path / "a.txt", "--start", "poses")
     assert "note: " in (printed := capsys.readouterr().out)
-    assert f"the principal point of camera 0 lies at the edge of the image: (0, 0) of {SMALL.width} x" in printed
+    assert (
+        f"the principal point of camera 0 lies at the edge of the image: (0, 0) of {SMALL.width} x"
+        in printed
+    )
 
 
 @pytest.mark.parametrize("name", ["a.nvm", "a.out", "a.ply", "a.json", "a.zip"])
-def test_a_problem_is_not_written_under_the_name_of_another_format(sequence, tmp_path, capsys, name):
+def test_a_problem_is_not_written_under_the_name_of_another_format(
+    sequence, tmp_path, capsys, name
+):
     assert build(sequence, tmp_path / name) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not list(tmp_path.glob("a.*"))

@@ -1,4 +1,5 @@
-"""Tracks, key-frames, triangulation, starts and the problem made of them: on points that are known exactly."""
+"""Tracks, key-frames, triangulation, starts and the problem made of them: on points that are known
+exactly."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ PIXELS = 3 / CALIBRATION.fx
 
 
 def street(views: int = 6, points: int = 40, seed: int = 0) -> tuple[np.ndarray, Views, np.ndarray]:
-    """Poses (camera to world) of a bent drive far from the origin, the same as views, and points before all of them."""
+    """Poses (camera to world) of a bent drive far from the origin, the same as views, and points
+    before all of them."""
     random = np.random.default_rng(seed)
     rotation = Rotation.from_rotvec(np.arange(views)[:, None] * [0.01, 0.05, -0.005]).as_matrix()
     centers = np.array([500.0, 10.0, -300.0]) + np.arange(views)[:, None] * [0.1, 0.02, 1.0]
@@ -36,7 +38,9 @@ def sight(views: Views, points: np.ndarray) -> Observations:
     """Every point seen in every view."""
     count = len(views.rotation)
     camera, track = np.tile(np.arange(count), len(points)), np.repeat(np.arange(len(points)), count)
-    local = np.einsum("nij,nj->ni", views.rotation[camera], points[track]) + views.translation[camera]
+    local = (
+        np.einsum("nij,nj->ni", views.rotation[camera], points[track]) + views.translation[camera]
+    )
     return Observations(camera, track, local[:, :2] / local[:, 2:])
 
 
@@ -50,7 +54,9 @@ def as_tracks(observations: Observations) -> Tracks:
 
 def places(*counts: int) -> list[np.ndarray]:
     """Key-points whose pixel says which they are: (image, number)."""
-    return [np.column_stack([np.full(n, float(i)), np.arange(float(n))]) for i, n in enumerate(counts)]
+    return [
+        np.column_stack([np.full(n, float(i)), np.arange(float(n))]) for i, n in enumerate(counts)
+    ]
 
 
 def arrays(matches: dict) -> dict:
@@ -59,7 +65,9 @@ def arrays(matches: dict) -> dict:
 
 def members(tracks: Tracks) -> set[tuple]:
     """The key-points of every track."""
-    return {tuple(map(tuple, tracks.pixels[tracks.track == t].tolist())) for t in range(tracks.count)}
+    return {
+        tuple(map(tuple, tracks.pixels[tracks.track == t].tolist())) for t in range(tracks.count)
+    }
 
 
 def test_matches_of_neighbours_and_over_gaps_make_one_track():
@@ -83,7 +91,10 @@ def test_no_track_is_ever_twice_in_an_image():
     """Random one-to-one matches contradict each other all the time."""
     random = np.random.default_rng(0)
     pairs = [(i, j) for j in range(8) for i in range(max(0, j - 3), j)]
-    matches = {pair: np.stack([random.permutation(30)[:12], random.permutation(30)[:12]], axis=1) for pair in pairs}
+    matches = {
+        pair: np.stack([random.permutation(30)[:12], random.permutation(30)[:12]], axis=1)
+        for pair in pairs
+    }
     tracks = join_matches(places(*[30] * 8), matches)
     assert len(np.unique(tracks.track * 8 + tracks.image)) == len(tracks.track) > 0
     assert np.bincount(tracks.track).min() >= 2
@@ -91,7 +102,9 @@ def test_no_track_is_ever_twice_in_an_image():
 
 
 def test_restricting_renumbers_images_and_drops_short_tracks():
-    tracks = make_tracks(np.array([0, 1, 2, 1, 2, 0]), np.array([5, 5, 5, 9, 9, 7]), np.zeros((6, 2)))
+    tracks = make_tracks(
+        np.array([0, 1, 2, 1, 2, 0]), np.array([5, 5, 5, 9, 9, 7]), np.zeros((6, 2))
+    )
     assert tracks.count == 2  # track 7 is seen once
     part = tracks.restrict([0, 2])
     assert part.image.tolist() == [0, 1]
@@ -113,9 +126,12 @@ def test_a_camera_that_only_turns_has_no_parallax():
 
 
 def test_a_sideways_step_has_the_parallax_of_its_depth():
-    """Points at depth 20 in a plane, seen after a step of 0.5: the rotation can hide some of 700 * 0.5 / 20 pixels."""
+    """Points at depth 20 in a plane, seen after a step of 0.5: the rotation can hide some of 700 *
+    0.5 / 20 pixels."""
     random = np.random.default_rng(1)
-    local = np.column_stack([random.uniform(-8, 8, (200, 2)), np.where(np.arange(200) % 2, 10.0, 1000.0)])
+    local = np.column_stack(
+        [random.uniform(-8, 8, (200, 2)), np.where(np.arange(200) % 2, 10.0, 1000.0)]
+    )
     after = local - [0.5, 0, 0]
     found = parallax(local[:, :2] / local[:, 2:], after[:, :2] / after[:, 2:], 700.0)
     assert 10 < found < 35
@@ -133,7 +149,9 @@ def test_automatic_keyframes_skip_frames_that_stand_still():
     assert choose(tracks, 10, "all", CALIBRATION, tuple(range(10))) == list(range(10))
     with pytest.raises(ProblemError, match="hardly moves in frames 0 to 2"):
         choose(tracks.restrict([0, 1, 2]), 3, "auto", CALIBRATION, (0, 1, 2))
-    with pytest.raises(ProblemError, match="--keyframes 99 leaves one key-frame of 10 in frames 0 to 9"):
+    with pytest.raises(
+        ProblemError, match="--keyframes 99 leaves one key-frame of 10 in frames 0 to 9"
+    ):
         choose(tracks, 10, "99", CALIBRATION, tuple(range(10)))
     for choice in ("0", "some", "-1", "1.5"):
         with pytest.raises(ProblemError, match="--keyframes must be"):
@@ -142,7 +160,9 @@ def test_automatic_keyframes_skip_frames_that_stand_still():
 
 def test_keyframes_that_share_too_little_are_named():
     tracks = make_tracks(
-        np.repeat([0, 1, 1, 2], 30), np.repeat([0, 100], 60) + np.tile(np.arange(30), 4), np.zeros((120, 2))
+        np.repeat([0, 1, 1, 2], 30),
+        np.repeat([0, 100], 60) + np.tile(np.arange(30), 4),
+        np.zeros((120, 2)),
     )
     with pytest.raises(ProblemError, match="key-frames 7 and 9 share 0 tracks"):
         choose(tracks, 3, "2", CALIBRATION, (7, 8, 9))
@@ -154,8 +174,14 @@ def test_keyframes_that_share_too_little_are_named():
 FORWARD = (0.3, 0.0, 1.0)
 
 
-def drive(steps: list[float], links: list[list[int]], direction: tuple[float, ...] = FORWARD, seed: int = 0) -> Tracks:
-    """Tracks of a drive by these steps: 80 points ahead for every list of views that see them, to 0.1 pixels."""
+def drive(
+    steps: list[float],
+    links: list[list[int]],
+    direction: tuple[float, ...] = FORWARD,
+    seed: int = 0,
+) -> Tracks:
+    """Tracks of a drive by these steps: 80 points ahead for every list of views that see them, to
+    0.1 pixels."""
     random = np.random.default_rng(seed)
     places = np.concatenate([[0.0], np.cumsum(steps)])[:, None] * direction
     image, track, pixels = [], [], []
@@ -178,7 +204,8 @@ def steps_of(views: Views) -> np.ndarray:
 
 
 def test_the_few_known_points_that_two_views_share_give_the_length_of_the_step():
-    """View 4 is 2.5 steps away from view 3 and knows 8 points of it, too few to be placed by them."""
+    """View 4 is 2.5 steps away from view 3 and knows 8 points of it, too few to be placed by
+    them."""
     tracks = drive([1.0, 1.0, 1.0, 2.5], [[0, 1, 2, 3], [3, 4], [0, 1, 2, 3, 4]])
     tracks = tracks.keep(tracks.track < 160 + 8)
     found, restarts = visual_odometry(tracks, 5, CALIBRATION, Build(), tuple(range(5)))
@@ -233,20 +260,27 @@ def test_exact_rays_give_exact_points():
     np.testing.assert_allclose(found.points, points, rtol=1e-9)
     assert found.error.max() < 1e-12
     local = np.einsum("nij,nj->ni", views.rotation[observations.camera], points[observations.track])
-    np.testing.assert_allclose(found.depth, (local + views.translation[observations.camera])[:, 2], rtol=1e-8)
+    np.testing.assert_allclose(
+        found.depth, (local + views.translation[observations.camera])[:, 2], rtol=1e-8
+    )
 
 
 def test_noisy_rays_give_the_least_squares_point():
     """The same minimum by SciPy."""
     _, views, points = street(points=5)
     observations = sight(views, points)
-    rays = observations.rays + 1e-3 * np.random.default_rng(2).standard_normal(observations.rays.shape)
+    rays = observations.rays + 1e-3 * np.random.default_rng(2).standard_normal(
+        observations.rays.shape
+    )
     found = triangulate(views, Observations(observations.camera, observations.track, rays))
     for track in range(5):
         rows = observations.track == track
 
         def residual(x, rows=rows):
-            local = views.rotation[observations.camera[rows]] @ x + views.translation[observations.camera[rows]]
+            local = (
+                views.rotation[observations.camera[rows]] @ x
+                + views.translation[observations.camera[rows]]
+            )
             return (local[:, :2] / local[:, 2:] - rays[rows]).ravel()
 
         best = least_squares(residual, points[track], xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -255,7 +289,8 @@ def test_noisy_rays_give_the_least_squares_point():
 
 
 def test_the_angle_is_that_between_the_farthest_views():
-    """Two cameras one apart, a point at depth d on the perpendicular through the middle: 2 atan(1 / 2d)."""
+    """Two cameras one apart, a point at depth d on the perpendicular through the middle: 2 atan(1 /
+    2d)."""
     views = Views(np.tile(np.eye(3), (2, 1, 1)), np.array([[0.5, 0, 0], [-0.5, 0, 0]]))
     depth = np.array([3.0, 10.0])
     found = triangulate(views, sight(views, np.array([[0, 0, 3.0], [0, 0, 10.0]])))
@@ -308,14 +343,18 @@ def test_the_problem_reprojects_exactly_through_bals_camera():
     problem = assemble(as_tracks(observations), views, CALIBRATION, (3, 4, 5, 6, 7, 9), NEARLY_ALL)
     assert (problem.num_points, problem.num_observations) == (len(points), len(observations.track))
     np.testing.assert_allclose(geometry.residuals(problem), 0, atol=1e-6)
-    np.testing.assert_allclose(problem.observations, CALIBRATION.fx * observations.rays * [1, -1], atol=1e-9)
+    np.testing.assert_allclose(
+        problem.observations, CALIBRATION.fx * observations.rays * [1, -1], atol=1e-9
+    )
     assert (geometry.depths(problem) > 0).all()
     assert (problem.cameras[:, 6:] == [CALIBRATION.fx, 0, 0]).all()
 
 
 def test_cameras_and_poses_are_the_same_thing():
     poses, views, points = street()
-    made = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL)
+    made = assemble(
+        as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL
+    )
     np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.cameras)), poses, atol=1e-9)
 
 

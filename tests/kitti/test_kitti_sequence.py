@@ -43,7 +43,8 @@ def test_the_second_camera_stands_beside_the_first(folder):
     """`P1 = K [I | b]` maps a point X of camera 0 to K (X + b): camera 1 stands at -b."""
     calibration = read_calibration(folder, 1)
     assert calibration.offset == pytest.approx((-0.5, 0, 0))
-    turned = np.array([[0.0, 0, 1, 10], [0, 1, 0, 20], [-1, 0, 0, 30]])[None]  # x of the camera is -z of the world
+    # x of the camera is -z of the world
+    turned = np.array([[0.0, 0, 1, 10], [0, 1, 0, 20], [-1, 0, 0, 30]])[None]
     poses = Poses(turned, "poses")
     np.testing.assert_allclose(poses_of(poses, (0,), calibration)[0, :, 3], [10, 20, 29.5])
 
@@ -63,7 +64,9 @@ def test_rays_of_pixels_are_the_inverse_of_the_matrix():
     calibration = Calibration(700.0, 650.0, 600.0, 180.0)
     place = np.array([0.3, -0.2, 2.0])
     pixel = np.array([[700.0, 0.0, 600.0], [0.0, 650.0, 180.0], [0.0, 0.0, 1.0]]) @ place
-    np.testing.assert_allclose(calibration.rays(pixel[None, :2] / pixel[2])[0], place[:2] / place[2])
+    np.testing.assert_allclose(
+        calibration.rays(pixel[None, :2] / pixel[2])[0], place[:2] / place[2]
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,7 +125,9 @@ def test_what_is_missing_is_named(folder, tmp_path):
 def test_an_image_without_a_number_is_refused(folder):
     (folder / "image_0" / "first.png").touch()
     (folder / "image_0" / ".second.png").touch()
-    with pytest.raises(ProblemError, match=r"first\.png: the name of an image must be its frame's number"):
+    with pytest.raises(
+        ProblemError, match=r"first\.png: the name of an image must be its frame's number"
+    ):
         read_sequence(folder)
 
 
@@ -131,7 +136,10 @@ def test_an_image_without_a_number_is_refused(folder):
     [
         ("", "holds no poses"),
         ("1 0 0 0 0 1 0 0 0 0 1\n", "line 1: has 11 numbers instead of 12"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 2 0 0 0 0 1 0\n", "line 2: the left 3 x 3 numbers are no rotation"),
+        (
+            "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 2 0 0 0 0 1 0\n",
+            "line 2: the left 3 x 3 numbers are no rotation",
+        ),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "are no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 x\n", "not a number"),
     ],
@@ -147,7 +155,9 @@ def test_poses_are_read_row_by_row_and_made_exact(tmp_path):
     path = tmp_path / "poses.txt"
     path.write_text("0 0 1 5 0 1 0 6 -1 0 0 7\n" * 3)
     poses = read_poses(path)
-    np.testing.assert_allclose(poses.matrices[1], [[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7]], atol=1e-15)
+    np.testing.assert_allclose(
+        poses.matrices[1], [[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7]], atol=1e-15
+    )
     with pytest.raises(ProblemError, match="has 3 poses, none for frame 3"):
         poses_of(poses, (1, 3), Calibration(1.0, 1.0, 0.0, 0.0))
 
@@ -164,7 +174,9 @@ def test_hidden_files_are_no_images(folder):
 def test_a_folder_of_hidden_files_holds_no_images(folder):
     (folder / "image_1").mkdir()
     (folder / "image_1" / "._000005.png").touch()
-    with pytest.raises(ProblemError, match=r"image_1: holds no images .*; images are in image_0: use --camera 0$"):
+    with pytest.raises(
+        ProblemError, match=r"image_1: holds no images .*; images are in image_0: use --camera 0$"
+    ):
         read_sequence(folder, camera=1)
 
 
@@ -180,7 +192,9 @@ def test_where_only_coloured_images_are_there_the_option_is_named(folder):
 BARE = "700 0 600.5 0 0 700 180.25 0 0 0 1 0\n700 0 600.5 -350 0 700 180.25 0 0 0 1 0\n"
 
 
-@pytest.mark.parametrize("change", [lambda text: text, lambda text: "\ufeff" + text.replace("\n", "\r\n\r\n")])
+@pytest.mark.parametrize(
+    "change", [lambda text: text, lambda text: "\ufeff" + text.replace("\n", "\r\n\r\n")]
+)
 def test_bare_rows_of_twelve_numbers_are_the_cameras_from_the_left_grey_one(folder, change):
     (folder / "calib.txt").write_bytes(change(BARE).encode())
     assert read_calibration(folder, 0) == Calibration(700.0, 700.0, 600.5, 180.25)
@@ -202,7 +216,10 @@ IDENTITY = "1 0 0 5 0 1 0 6 0 0 1 7"
     [
         (f"1 {IDENTITY}", "line 1: has 13 numbers instead of 12"),
         (f"{IDENTITY}\n\n{IDENTITY} x", "line 3: 'x' is not a number"),
-        (f"{IDENTITY}\n\n{IDENTITY.replace('7', '-nan(ind)')}", r"line 3: '-nan\(ind\)' is not a finite number"),
+        (
+            f"{IDENTITY}\n\n{IDENTITY.replace('7', '-nan(ind)')}",
+            r"line 3: '-nan\(ind\)' is not a finite number",
+        ),
         (f"{IDENTITY}\n{IDENTITY.replace('7', '1_0')}", "line 2: '1_0' is not a number"),
     ],
 )

@@ -1,4 +1,5 @@
-"""Trajectory errors against hand-made cases, SciPy, and the development kit's program retold with 4 x 4 matrices."""
+"""Trajectory errors against hand-made cases, SciPy, and the development kit's program retold with 4
+x 4 matrices."""
 
 from __future__ import annotations
 
@@ -7,7 +8,13 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from jaxba.kitti.evaluate import DEVKIT_LENGTHS, absolute_errors, path_length, relative_errors, segment_errors
+from jaxba.kitti.evaluate import (
+    DEVKIT_LENGTHS,
+    absolute_errors,
+    path_length,
+    relative_errors,
+    segment_errors,
+)
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.similarity import umeyama
 
@@ -15,8 +22,12 @@ from jaxba.problem.similarity import umeyama
 def wander(count: int, seed: int, step: float = 1.0) -> np.ndarray:
     """A random walk of poses."""
     random = np.random.default_rng(seed)
-    rotation = Rotation.from_rotvec(np.cumsum(0.05 * random.standard_normal((count, 3)), axis=0)).as_matrix()
-    centers = np.cumsum(step * (rotation[:, :, 2] + 0.1 * random.standard_normal((count, 3))), axis=0)
+    rotation = Rotation.from_rotvec(
+        np.cumsum(0.05 * random.standard_normal((count, 3)), axis=0)
+    ).as_matrix()
+    centers = np.cumsum(
+        step * (rotation[:, :, 2] + 0.1 * random.standard_normal((count, 3))), axis=0
+    )
     return np.concatenate([rotation, centers[:, :, None]], axis=2)
 
 
@@ -67,14 +78,19 @@ def test_the_alignment_minimises_the_rmse_over_all_similarities():
     estimate = noisy(moved(truth, 0.3, TURN, SHIFT), 3, 0.3)
 
     def mean_square(x):
-        centers = np.exp(x[0]) * estimate[:, :, 3] @ Rotation.from_rotvec(x[1:4]).as_matrix().T + x[4:]
+        centers = (
+            np.exp(x[0]) * estimate[:, :, 3] @ Rotation.from_rotvec(x[1:4]).as_matrix().T + x[4:]
+        )
         return ((centers - truth[:, :, 3]) ** 2).sum(axis=1).mean()
 
-    start = np.concatenate([[-np.log(0.3)], Rotation.from_matrix(TURN.T).as_rotvec(), -SHIFT @ TURN / 0.3])
+    start = np.concatenate(
+        [[-np.log(0.3)], Rotation.from_matrix(TURN.T).as_rotvec(), -SHIFT @ TURN / 0.3]
+    )
     best = minimize(mean_square, start, method="BFGS", options={"gtol": 1e-9})
     found = absolute_errors(align(estimate, truth), truth).rmse
     assert found <= np.sqrt(best.fun) * (1 + 1e-12)
-    assert found == pytest.approx(np.sqrt(best.fun), rel=1e-4)  # as far as BFGS comes, by differences
+    # as far as BFGS comes, by differences
+    assert found == pytest.approx(np.sqrt(best.fun), rel=1e-4)
 
 
 def test_the_rotation_is_that_of_scipys_wahba_solution():
@@ -91,7 +107,8 @@ def test_a_mirror_image_is_aligned_by_a_rotation():
 
 
 def test_errors_of_a_square_with_a_raised_corner():
-    """Corners of a unit square around the origin, one raised by h, without alignment: rmse h / 2, the largest h."""
+    """Corners of a unit square around the origin, one raised by h, without alignment: rmse h / 2,
+    the largest h."""
     square = np.zeros((4, 3, 4))
     square[:, :, :3] = np.eye(3)
     square[:, :2, 3] = [[1, 1], [-1, 1], [-1, -1], [1, -1]]
@@ -116,7 +133,9 @@ def test_tiny_and_straight_angles_keep_their_digits():
     truth = wander(2, 8)
     for angle in (1e-7, 179.9999):
         estimate = truth.copy()
-        estimate[1, :, :3] = truth[1, :, :3] @ Rotation.from_rotvec(np.deg2rad([angle, 0, 0])).as_matrix()
+        estimate[1, :, :3] = (
+            truth[1, :, :3] @ Rotation.from_rotvec(np.deg2rad([angle, 0, 0])).as_matrix()
+        )
         assert relative_errors(estimate, truth)[1].largest == pytest.approx(angle, rel=1e-6)
 
 
@@ -126,7 +145,9 @@ def test_relative_errors_do_not_depend_on_where_the_estimate_stands():
     there = moved(estimate, 1.0, TURN, SHIFT)
     for a, b in zip(relative_errors(estimate, truth), relative_errors(there, truth), strict=True):
         assert a == pytest.approx(b, rel=1e-9)
-    assert segment_errors(estimate, truth, (10.0,)) == pytest.approx(segment_errors(there, truth, (10.0,)), rel=1e-9)
+    assert segment_errors(estimate, truth, (10.0,)) == pytest.approx(
+        segment_errors(there, truth, (10.0,)), rel=1e-9
+    )
 
 
 def test_a_path_that_is_five_percent_too_long_has_segment_errors_of_five_percent():
@@ -154,7 +175,10 @@ def devkit(estimate: np.ndarray, truth: np.ndarray, lengths) -> tuple[float, flo
     t_err, r_err = [], []
     for first_frame in range(0, len(gt), 10):
         for length in lengths:
-            last_frame = next((i for i in range(first_frame, len(dist)) if dist[i] > dist[first_frame] + length), -1)
+            last_frame = next(
+                (i for i in range(first_frame, len(dist)) if dist[i] > dist[first_frame] + length),
+                -1,
+            )
             if last_frame == -1:
                 continue
             pose_delta_gt = np.linalg.inv(gt[first_frame]) @ gt[last_frame]

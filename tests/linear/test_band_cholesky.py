@@ -30,21 +30,32 @@ SHAPES = [
 def system(cameras: int, width: int, tile: int) -> tuple[Band, np.ndarray, np.ndarray, np.ndarray]:
     """Band, its blocks, the same matrix dense in the cameras' own order, and a right-hand side.
 
-    Positive definite: one plus a square for every two cameras that are linked. Half of those within the band are not.
-    """
+    Positive definite: one plus a square for every two cameras that are linked. Half of those within
+    the band are not."""
     rng = np.random.default_rng(100 * cameras + width)
     rank = rng.permutation(cameras)
     row, column = np.tril_indices(cameras)
-    kept = (row == column) | (row - column == width) | ((row - column < width) & (rng.random(len(row)) < 0.5))
+    kept = (
+        (row == column)
+        | (row - column == width)
+        | ((row - column < width) & (rng.random(len(row)) < 0.5))
+    )
     row, column = row[kept], column[kept]
     full = np.eye(9 * cameras).reshape(cameras, 9, cameras, 9)
     for a, b in zip(row, column, strict=True):
         two = rng.normal(size=(2, 9, 9)) / 3
         for (i, one), (j, other) in itertools.product(zip((a, b), two, strict=True), repeat=2):
             full[i, :, j] += one.T @ other
-    blocks = np.stack([*(full[a, :, b] for a, b in zip(row, column, strict=True)), np.zeros((9, 9))])
+    blocks = np.stack(
+        [*(full[a, :, b] for a, b in zip(row, column, strict=True)), np.zeros((9, 9))]
+    )
     own = full[rank][:, :, rank].reshape(9 * cameras, 9 * cameras)  # camera c stands at rank[c]
-    return band_of(row * cameras + column, rank, width, tile), blocks, own, rng.normal(size=(cameras, 9))
+    return (
+        band_of(row * cameras + column, rank, width, tile),
+        blocks,
+        own,
+        rng.normal(size=(cameras, 9)),
+    )
 
 
 def on_diagonal(band: Band, camera: int) -> int:
@@ -69,13 +80,16 @@ def test_float32_is_solved_to_single_precision(cameras, width, tile):
     found = solve(band, jnp.asarray(blocks, jnp.float32), jnp.asarray(right, jnp.float32))
     assert found.dtype == jnp.float32
     condition = np.linalg.cond(matrix)
-    assert np.linalg.norm(found - expected) <= condition * np.finfo(np.float32).eps * np.linalg.norm(expected)
+    assert np.linalg.norm(found - expected) <= condition * np.finfo(
+        np.float32
+    ).eps * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize(("cameras", "width", "tile"), SHAPES)
 def test_a_system_that_is_not_positive_definite_has_no_finite_solution(cameras, width, tile):
-    """A diagonal entry is lowered until the determinant has just changed its sign: `det(S - t e e^T) = det S (1 - t
-    e.S^-1 e)`. It is that of the first camera in the band, of the last, or of any other."""
+    """A diagonal entry is lowered until the determinant has just changed its sign: `det(S - t e
+    e^T) = det S (1 - t e.S^-1 e)`. It is that of the first camera in the band, of the last, or of
+    any other."""
     band, blocks, matrix, right = system(cameras, width, tile)
     order = np.argsort(band.rank)
     for camera in {int(order[0]), int(order[-1]), cameras // 2}:
@@ -108,7 +122,9 @@ def test_the_factor_multiplies_back_to_the_matrix():
     assert not lower[count * size :].any()  # nothing below the last tile
     lower = lower[: count * size]
     place = (9 * np.asarray(band.rank)[:, None] + np.arange(9)).ravel()
-    np.testing.assert_allclose((lower @ lower.T)[np.ix_(place, place)], matrix, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(
+        (lower @ lower.T)[np.ix_(place, place)], matrix, rtol=1e-11, atol=1e-11
+    )
     padding = slice(90, None)
     assert np.array_equal(lower[padding, padding], np.eye(18))
     assert not lower[padding, :90].any()

@@ -14,7 +14,8 @@ solve = jax.jit(factor_and_solve)
 
 
 def spd(n: int, condition: float = 1e4, seed: int = 0) -> np.ndarray:
-    """Eigenvalues from 1 down to 1 / condition; the eigenvectors are those of a reflection, so none is sparse."""
+    """Eigenvalues from 1 down to 1 / condition; the eigenvectors are those of a reflection, so none
+    is sparse."""
     normal = np.random.default_rng(seed).normal(size=n)
     basis = np.eye(n) - 2 * np.outer(normal, normal) / (normal @ normal)
     matrix = basis * np.geomspace(1 / condition, 1, n) @ basis.T
@@ -33,7 +34,8 @@ def triangle(panels: Panels) -> np.ndarray:
     return lower
 
 
-SIZES = [1, 9, MIN_UNKNOWNS - 1, MIN_UNKNOWNS, MIN_UNKNOWNS + 1]  # four panels, and one more of one column
+# four panels, and one more of one column
+SIZES = [1, 9, MIN_UNKNOWNS - 1, MIN_UNKNOWNS, MIN_UNKNOWNS + 1]
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -53,7 +55,8 @@ def test_a_matrix_with_one_negative_eigenvalue_has_no_finite_solution(n):
 
 @pytest.mark.parametrize("n", [MIN_UNKNOWNS - 1, MIN_UNKNOWNS])
 def test_units_of_the_unknowns_do_not_matter(n):
-    """Focal lengths in pixels beside rotations in radians: the scale spans 24 orders of magnitude."""
+    """Focal lengths in pixels beside rotations in radians: the scale spans 24 orders of
+    magnitude."""
     matrix, right = spd(n), np.random.default_rng(1).normal(size=n)
     unit = np.random.default_rng(2).permutation(np.geomspace(1e-6, 1e6, n))
     found = solve(matrix * unit[:, None] * unit, right * unit) * unit
@@ -76,20 +79,26 @@ def test_float32_is_solved_to_single_precision(n):
     found = solve(matrix.astype(np.float32), right.astype(np.float32))
     assert found.dtype == jnp.float32
     expected = np.linalg.solve(matrix, right)
-    assert np.linalg.norm(found - expected) <= 100 * np.finfo(np.float32).eps * np.linalg.norm(expected)
+    assert np.linalg.norm(found - expected) <= 100 * np.finfo(np.float32).eps * np.linalg.norm(
+        expected
+    )
 
 
 @pytest.mark.parametrize("n", [1, PANEL - 1, PANEL, PANEL + 1, 2 * PANEL, 2 * PANEL + 37])
 def test_panels_multiply_back_to_the_matrix(n):
     matrix = spd(n)
     panels = jax.jit(factor_panels)(matrix)
-    assert [len(inverse) for inverse in panels.inverses] == [min(PANEL, n - k) for k in range(0, n, PANEL)]
+    assert [len(inverse) for inverse in panels.inverses] == [
+        min(PANEL, n - k) for k in range(0, n, PANEL)
+    ]
     lower = triangle(panels)
     assert np.linalg.norm(lower @ lower.T - matrix) <= 1e-13 * np.linalg.norm(matrix)
     np.testing.assert_allclose(lower, np.linalg.cholesky(matrix), rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize(("n", "sizes"), [(32, [8, 8, 8, 8]), (33, [9, 9, 9, 6]), (41, [11, 11, 11, 8])])
+@pytest.mark.parametrize(
+    ("n", "sizes"), [(32, [8, 8, 8, 8]), (33, [9, 9, 9, 6]), (41, [11, 11, 11, 8])]
+)
 def test_large_systems_get_wider_panels_instead_of_more(monkeypatch, n, sizes):
     """As with more than 24 panels of 128, at the size of a test."""
     monkeypatch.setattr(cholesky, "PANEL", 8)

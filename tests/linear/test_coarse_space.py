@@ -1,9 +1,9 @@
-"""The two-level preconditioner where frames and lenses are shared, something is constant, or there are priors.
+"""The two-level preconditioner where frames and lenses are shared, something is constant, or there
+are priors.
 
-The truth is the damped system made densely from the rows of the linear model. The coarse level is a projection that is
-orthogonal in S where its matrix is that of its motions, and these are motions of what is shared; then it adds at most
-one to an eigenvalue of `M^-1 S`, and lowers none.
-"""
+The truth is the damped system made densely from the rows of the linear model. The coarse level is a
+projection that is orthogonal in S where its matrix is that of its motions, and these are motions of
+what is shared; then it adds at most one to an eigenvalue of `M^-1 S`, and lowers none."""
 
 from __future__ import annotations
 
@@ -34,12 +34,17 @@ KINDS = {
     "free places, a scale bar": 21,
     "no rigs, a constant pose": 3,
 }
-SLOW = ("free places, priors of positions", "constant places, surveyed points", "free places, a scale bar")
+SLOW = (
+    "free places, priors of positions",
+    "constant places, surveyed points",
+    "free places, a scale bar",
+)
 
 
 @functools.partial(jax.jit, compiler_options=compiler_options("quick"))
 def parts(layout, problem, damping):
-    """The linear model, D of cameras and points, T's projection, and both preconditioners as matrices."""
+    """The linear model, D of cameras and points, T's projection, and both preconditioners as
+    matrices."""
     state = initial_state(layout, problem, OPTIONS, jnp.float64)
     linear = only_free(layout, linearize(layout, state.cameras, state.points, OPTIONS.loss), "free")
     system = DampedSystem.of(layout, linear, state.cameras, state.points, damping, OPTIONS)
@@ -52,8 +57,12 @@ def parts(layout, problem, damping):
 
 
 @pytest.mark.parametrize("damping", [1e-8, 1e-3])
-@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS])
-def test_the_coarse_level_raises_the_least_eigenvalue_and_none_by_more_than_one(kind, damping, monkeypatch):
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS]
+)
+def test_the_coarse_level_raises_the_least_eigenvalue_and_none_by_more_than_one(
+    kind, damping, monkeypatch
+):
     monkeypatch.setattr(camera_clusters, "CLUSTER_CAMERAS", 4)
     problem = laid_out(in_frames(draw(KINDS[kind])[0]))
     layout = build_layout(problem, OPTIONS)
@@ -67,12 +76,16 @@ def test_the_coarse_level_raises_the_least_eigenvalue_and_none_by_more_than_one(
     camera, point = camera.reshape(rows, -1), point.reshape(rows, -1)
     coupling = camera.T @ point
     schur = camera.T @ camera + block_diag(*own)
-    schur -= coupling @ np.linalg.solve(point.T @ point + np.diag(np.concatenate(of_points)), coupling.T)
+    schur -= coupling @ np.linalg.solve(
+        point.T @ point + np.diag(np.concatenate(of_points)), coupling.T
+    )
 
     values, vectors = np.linalg.eigh(projector)
     basis = vectors[:, values > 0.5]
     root = np.linalg.cholesky(basis.T @ schur @ basis)
-    one, two = (np.linalg.eigvalsh(root.T @ basis.T @ inverse @ basis @ root) for inverse in inverses)
+    one, two = (
+        np.linalg.eigvalsh(root.T @ basis.T @ inverse @ basis @ root) for inverse in inverses
+    )
     assert two[0] > 2 * one[0]
     assert np.all(two >= one * (1 - 1e-6))
     assert np.all(two <= (one + 1) * (1 + 1e-6))

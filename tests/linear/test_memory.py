@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba import Refinement, StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
+from jaxba import (
+    Refinement,
+    StepOptions,
+    build_layout,
+    initial_state,
+    lm_step,
+    random_scene,
+    scene_like,
+)
 from jaxba.lm.termination import Tolerances
 from jaxba.solver import sharded
 from jaxba.solver.estimate import BYTES_IN_PARTS, BYTES_PER_OBSERVATION
@@ -42,18 +50,32 @@ def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, refin
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_a_step_in_parts_and_the_problem_keep_to_the_stated_bytes_per_observation(dtype, monkeypatch):
+def test_a_step_in_parts_and_the_problem_keep_to_the_stated_bytes_per_observation(
+    dtype, monkeypatch
+):
     problem = random_scene(replace(scene_like("random-150"), cameras=50), 0)
-    for name, value in (("LARGE", 1), ("PART", problem.num_observations // 16), ("PART_OF_CAMERA", 0)):
+    for name, value in (
+        ("LARGE", 1),
+        ("PART", problem.num_observations // 16),
+        ("PART_OF_CAMERA", 0),
+    ):
         monkeypatch.setattr(sharded, name, value)
-    setup = set_up(problem, "guarded", SolveOptions(linear_solver="implicit", dtype=dtype), in_parts=True)
+    setup = set_up(
+        problem, "guarded", SolveOptions(linear_solver="implicit", dtype=dtype), in_parts=True
+    )
     limit = np.asarray(5, np.int32)
     carry = setup.shards.begin(setup.policy, limit)
     given = setup.shards.layout, carry, setup.policy, Tolerances(), limit
     memory = sharded._run.lower(*given, **setup.shards.static, length=0).compile().memory_analysis()
     assert memory is not None
     parts = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
-    arrays = problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index
+    arrays = (
+        problem.cameras,
+        problem.points,
+        problem.observations,
+        problem.camera_index,
+        problem.point_index,
+    )
     used = (parts + sum(array.nbytes for array in arrays)) / problem.num_observations
     assert 0.5 * BYTES_IN_PARTS[dtype] < used < BYTES_IN_PARTS[dtype]
 
@@ -65,5 +87,7 @@ def test_memory_of_an_implicit_step_grows_with_the_observations_only():
         replace(scene_like("random-150"), points=points, observations=4 * points, cameras=50)
         for points in (5_000, 20_000)
     ]
-    small, large = (bytes_per_observation(random_scene(size, 0), options, jnp.float64) for size in sizes)
+    small, large = (
+        bytes_per_observation(random_scene(size, 0), options, jnp.float64) for size in sizes
+    )
     assert large < 1.1 * small

@@ -20,8 +20,12 @@ from jaxba.structure.segment_sums import total
     [("explicit", "mixed", 1e-6), ("implicit", "float32", 1e-4)],
 )
 def test_every_type_ends_at_the_cost_of_float64(linear_solver, dtype, gap):
-    problem = random_scene(replace(scene_like("random-150"), cameras=12, points=300, observations=1300), 3)
-    exact, rough = (solve(problem, linear_solver=linear_solver, dtype=name) for name in ("float64", dtype))
+    problem = random_scene(
+        replace(scene_like("random-150"), cameras=12, points=300, observations=1300), 3
+    )
+    exact, rough = (
+        solve(problem, linear_solver=linear_solver, dtype=name) for name in ("float64", dtype)
+    )
     assert exact.converged
     assert rough.converged
     assert exact.initial_cost > 2 * exact.final_cost

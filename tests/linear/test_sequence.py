@@ -1,4 +1,5 @@
-"""Steps on a sequence long enough for a band and for several clusters, against the dense normal equations."""
+"""Steps on a sequence long enough for a band and for several clusters, against the dense normal
+equations."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ OPTIONS = {
     "sparse": replace(TO_THE_END, linear_solver="sparse"),
     "implicit": TO_THE_END,
     "schur-jacobi": replace(
-        TO_THE_END, conjugate_gradients=replace(UNTIL_NOTHING_CHANGES, preconditioner="schur-jacobi")
+        TO_THE_END,
+        conjugate_gradients=replace(UNTIL_NOTHING_CHANGES, preconditioner="schur-jacobi"),
     ),
 }
 DAMPING = 1e-4
@@ -31,7 +33,9 @@ DAMPING = 1e-4
 @functools.cache
 def sequence() -> BundleProblem:
     """70 cameras in a row, numbered at random; no point is seen by more than eight."""
-    scene = random_scene(SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
+    scene = random_scene(
+        SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0
+    )
     order = np.random.default_rng(0).permutation(70)
     cameras = np.empty_like(scene.cameras)
     cameras[order] = scene.cameras
@@ -61,7 +65,12 @@ def test_the_sequence_is_factored_as_a_band_and_has_several_clusters():
 
 @pytest.mark.parametrize("damping", [DAMPING, 1.0])
 @pytest.mark.parametrize(
-    "name", ["explicit", "implicit", *(pytest.param(x, marks=pytest.mark.slow) for x in ("sparse", "schur-jacobi"))]
+    "name",
+    [
+        "explicit",
+        "implicit",
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("sparse", "schur-jacobi")),
+    ],
 )
 def test_every_solver_takes_the_dense_normal_equation_step(name, damping):
     before, after, info = taken(name, damping)
@@ -77,7 +86,9 @@ def test_every_solver_takes_the_dense_normal_equation_step(name, damping):
     cameras, wanted = found[:size].reshape(-1, 9), expected.step[:size].reshape(-1, 9)
     for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
         assert np.linalg.norm((cameras - wanted)[:, part]) <= 1e-8 * np.linalg.norm(wanted[:, part])
-    assert np.linalg.norm(found[size:] - expected.step[size:]) <= 1e-8 * np.linalg.norm(expected.step[size:])
+    assert np.linalg.norm(found[size:] - expected.step[size:]) <= 1e-8 * np.linalg.norm(
+        expected.step[size:]
+    )
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """Preconditioners of the reduced camera system against the same matrices made densely.
 
-The truth is `S = B + D_c - E^T (C + D_p)^-1 E` from the dense Jacobian of `support.linear`, which shares no code with
-jaxba's. Only the modes P are taken from jaxba, and those are held against what a similarity does to the residuals.
-"""
+The truth is `S = B + D_c - E^T (C + D_p)^-1 E` from the dense Jacobian of `support.linear`, which
+shares no code with jaxba's. Only the modes P are taken from jaxba, and those are held against what
+a similarity does to the residuals."""
 
 from __future__ import annotations
 
@@ -53,7 +53,12 @@ def part(problem: BundleProblem, cameras: int, points: int) -> BundleProblem:
 # cameras a cluster, problem, options, lambda
 CASES = {
     "three-clusters": (2, support.tiny, replace(MANIFOLD, coordinates=IDENTITY), 1000.0),
-    "unseen-camera": (2, lambda: whitened(support.odd()), replace(MANIFOLD, loss=Loss("huber", 1.7)), 0.1),
+    "unseen-camera": (
+        2,
+        lambda: whitened(support.odd()),
+        replace(MANIFOLD, loss=Loss("huber", 1.7)),
+        0.1,
+    ),
     "more-clusters-than-points": (1, lambda: part(support.paper(0), 5, 2), MANIFOLD, 0.1),
     "two-cameras": (8, lambda: part(support.tiny(), 2, 40), MANIFOLD, 0.1),
     "single": (8, support.single, MANIFOLD, 0.1),
@@ -91,10 +96,14 @@ class Case:
         return dense.reshape(9 * len(label), -1)
 
 
-# without LLVM's optimisations, which would take half of this file's time: the programs are run once or twice
-@functools.partial(jax.jit, static_argnames=("options",), compiler_options=compiler_options("quick"))
+# without LLVM's optimisations, which would take half of this file's time: the programs are run once
+# or twice
+@functools.partial(
+    jax.jit, static_argnames=("options",), compiler_options=compiler_options("quick")
+)
 def everything(layout, problem, damping, more, options: StepOptions):
-    """Modes, coarse system, two-level preconditioner and diagonal blocks, with `more` added to the camera blocks."""
+    """Modes, coarse system, two-level preconditioner and diagonal blocks, with `more` added to the
+    camera blocks."""
     state = initial_state(layout, problem, options, jnp.float64)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     system = DampedSystem.of(layout, linear, state.cameras, state.points, damping, options)
@@ -115,7 +124,11 @@ def dense_schur(problem: BundleProblem, options: StepOptions, damping: float) ->
     _, jacobian = support.linear(problem, options)
     square = jacobian.T @ jacobian
     diagonal = np.diagonal(square)
-    clamped = np.clip(diagonal, 1e-6, 1e32) if options.coordinates.scaling == "diagonal" else np.ones_like(diagonal)
+    clamped = (
+        np.clip(diagonal, 1e-6, 1e32)
+        if options.coordinates.scaling == "diagonal"
+        else np.ones_like(diagonal)
+    )
     square = square + np.diag(damping * clamped)
     n = 9 * problem.num_cameras
     schur = square[:n, :n] - square[:n, n:] @ np.linalg.solve(square[n:, n:], square[n:, :n])
@@ -126,7 +139,8 @@ def dense_schur(problem: BundleProblem, options: StepOptions, damping: float) ->
 
 @functools.cache
 def make(name: str, more: float = 0.0) -> Case:
-    """A case, with a matrix that has two eigenvalues `-more` added to the lens of every camera block."""
+    """A case, with a matrix that has two eigenvalues `-more` added to the lens of every camera
+    block."""
     cluster_cameras, problem, options, damping = CASES[name]
     problem = problem()
     with pytest.MonkeyPatch.context() as patch:
@@ -137,7 +151,11 @@ def make(name: str, more: float = 0.0) -> Case:
     added[:, 6:, 6:] = more * (2 - np.eye(3))
     found = everything(layout, problem, jnp.asarray(damping), added, options)
     label = np.asarray(layout.clusters.label)
-    return Case(problem, dense_schur(problem, options, damping), Found(label, *(np.asarray(x) for x in found)))
+    return Case(
+        problem,
+        dense_schur(problem, options, damping),
+        Found(label, *(np.asarray(x) for x in found)),
+    )
 
 
 @pytest.fixture(params=CASES)
@@ -150,7 +168,12 @@ def test_the_cases_have_the_clusters_that_they_are_named_after():
     count = lambda name: make(name).found.label.max() + 1
     names = ("three-clusters", "unseen-camera", "two-cameras", "single")
     assert [count(name) for name in names] == [3, 4, 1, 1]
-    assert count("more-clusters-than-points") == 5 > make("more-clusters-than-points").problem.num_points == 2
+    assert (
+        count("more-clusters-than-points")
+        == 5
+        > make("more-clusters-than-points").problem.num_points
+        == 2
+    )
 
 
 # Modes
@@ -207,12 +230,16 @@ def test_clusters_sum_their_cameras():
     rows = np.random.default_rng(0).normal(size=(problem.num_cameras, 4))
     expected = np.zeros((len(layout.clusters.members), 4))
     np.add.at(expected, np.asarray(layout.clusters.label), rows)
-    np.testing.assert_allclose(cluster_sum(layout.clusters, jnp.asarray(rows)), expected, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(
+        cluster_sum(layout.clusters, jnp.asarray(rows)), expected, rtol=1e-13, atol=1e-14
+    )
 
 
 def test_a_layout_without_clusters_is_refused():
     problem = support.tiny()
-    layout = build_layout(problem, replace(MANIFOLD, conjugate_gradients=ConjugateGradients("schur-jacobi")))
+    layout = build_layout(
+        problem, replace(MANIFOLD, conjugate_gradients=ConjugateGradients("schur-jacobi"))
+    )
     with pytest.raises(ValueError, match="no clusters: build it with the options"):
         everything(layout, problem, jnp.asarray(0.1), np.zeros((6, 9, 9)), MANIFOLD)
 
@@ -233,7 +260,8 @@ def test_the_two_level_preconditioner_is_symmetric_and_positive_definite(case):
 
 
 def test_the_coarse_level_solves_for_every_motion_of_whole_clusters(case):
-    """`P (P^T S P)^-1 P^T S P = P`, also where the modes of a cluster of one camera depend on each other."""
+    """`P (P^T S P)^-1 P^T S P = P`, also where the modes of a cluster of one camera depend on each
+    other."""
     p = case.prolongation
     size = np.sqrt(np.diagonal(case.schur))[:, None]
     unit = np.linalg.norm(p * size, axis=0)
@@ -244,7 +272,8 @@ def test_the_coarse_level_solves_for_every_motion_of_whole_clusters(case):
 
 
 def test_the_coarse_level_answers_with_motions_of_whole_clusters_only(case):
-    """Its range is that of P: nine directions a cluster of one camera, ten a larger one, none without a camera seen."""
+    """Its range is that of P: nine directions a cluster of one camera, ten a larger one, none
+    without a camera seen."""
     seen = np.bincount(case.problem.camera_index, minlength=case.problem.num_cameras) > 0
     members = np.bincount(case.found.label, seen)
     rank = int(np.sum(np.minimum(9 * members, MODES)))
@@ -264,7 +293,9 @@ def test_a_coarse_system_that_cannot_be_factored_is_left_out(more):
     lower = np.tril(found.coarse_system)
     if np.isfinite(more):
         assert np.diagonal(lower).min() > 0 > np.linalg.eigvalsh(lower + np.tril(lower, -1).T)[0]
-    np.testing.assert_allclose(found.two_level, found.fine, rtol=1e-8, atol=1e-12 * np.abs(found.fine).max())
+    np.testing.assert_allclose(
+        found.two_level, found.fine, rtol=1e-8, atol=1e-12 * np.abs(found.fine).max()
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name != "unseen-camera"])
@@ -280,10 +311,13 @@ def test_diagonal_blocks_are_those_of_the_reduced_camera_system(name):
 
 
 def test_diagonal_blocks_leave_out_only_what_a_point_seen_twice_by_one_camera_adds():
-    """Cameras that see all their points once have exact blocks, beside others that do not; an unseen one a unit."""
+    """Cameras that see all their points once have exact blocks, beside others that do not; an
+    unseen one a unit."""
     case = make("unseen-camera")
     problem = case.problem
-    pairs, counts = np.unique(problem.camera_index * problem.num_points + problem.point_index, return_counts=True)
+    pairs, counts = np.unique(
+        problem.camera_index * problem.num_points + problem.point_index, return_counts=True
+    )
     double = set((pairs[counts > 1] // problem.num_points).tolist())
     assert double
     assert np.array_equal(case.found.blocks[6], np.eye(9))

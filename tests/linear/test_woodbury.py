@@ -1,4 +1,5 @@
-"""The solve by way of the points' side against NumPy's solution of the formed reduced camera system."""
+"""The solve by way of the points' side against NumPy's solution of the formed reduced camera
+system."""
 
 from __future__ import annotations
 
@@ -17,12 +18,15 @@ CAMERAS, COLUMNS = 4, 6
 
 
 def system(seed: int = 0, smallest: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """W, B and b; `smallest` is the least eigenvalue of S relative to B's metric: negative makes S indefinite."""
+    """W, B and b; `smallest` is the least eigenvalue of S relative to B's metric: negative makes S
+    indefinite."""
     rng = np.random.default_rng(seed)
     root = 0.3 * rng.normal(size=(CAMERAS, 9, 9)) + 3 * np.eye(9)
     left, _ = np.linalg.qr(rng.normal(size=(9 * CAMERAS, COLUMNS)))
     turn, _ = np.linalg.qr(rng.normal(size=(COLUMNS, COLUMNS)))
-    scaled = left * np.sqrt(1 - np.geomspace(abs(smallest), 0.9, COLUMNS) * np.sign(smallest)) @ turn
+    scaled = (
+        left * np.sqrt(1 - np.geomspace(abs(smallest), 0.9, COLUMNS) * np.sign(smallest)) @ turn
+    )
     wide = (root @ scaled.reshape(CAMERAS, 9, COLUMNS)).reshape(9 * CAMERAS, COLUMNS)
     return wide, root @ root.transpose(0, 2, 1), rng.normal(size=(CAMERAS, 9))
 
@@ -55,9 +59,14 @@ def test_the_formed_system_is_solved_as_numpy_solves_it(seed):
 
 
 def test_units_of_the_unknowns_do_not_matter():
-    """Focal lengths in pixels beside rotations in radians: the scale spans 24 orders of magnitude."""
+    """Focal lengths in pixels beside rotations in radians: the scale spans 24 orders of
+    magnitude."""
     wide, blocks, right = system()
-    unit = np.random.default_rng(2).permutation(np.geomspace(1e-6, 1e6, 9 * CAMERAS)).reshape(CAMERAS, 9)
+    unit = (
+        np.random.default_rng(2)
+        .permutation(np.geomspace(1e-6, 1e6, 9 * CAMERAS))
+        .reshape(CAMERAS, 9)
+    )
     scaled = blocks * unit[:, :, None] * unit[:, None, :]
     found = solve(wide * unit.reshape(-1, 1), scaled, right * unit) * unit
     check(found, wide, blocks, right, 1e-10)
@@ -84,7 +93,10 @@ def test_a_system_that_is_not_positive_definite_has_no_finite_solution_and_harms
 
 
 def test_batches_of_batches_are_solved_too():
-    batch = [np.stack(parts).reshape(2, 3, *parts[0].shape) for parts in zip(*map(system, range(6)), strict=True)]
+    batch = [
+        np.stack(parts).reshape(2, 3, *parts[0].shape)
+        for parts in zip(*map(system, range(6)), strict=True)
+    ]
     found = jax.jit(jax.vmap(jax.vmap(solve)))(*batch)
     for seed in range(6):
         check(found[divmod(seed, 3)], *system(seed), 1e-10)
@@ -126,7 +138,9 @@ def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypat
     one = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
     monkeypatch.setattr(factored, "has_few_points", lambda points, cameras: False)
     other = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
-    moved = lambda after: jax.tree.leaves(jax.tree.map(lambda a, b: np.asarray(a - b), after, before))
+    moved = lambda after: jax.tree.leaves(
+        jax.tree.map(lambda a, b: np.asarray(a - b), after, before)
+    )
     for found, truth in zip(moved(one), moved(other), strict=True):
         assert np.linalg.norm(found - truth) <= 1e-7 * np.linalg.norm(truth)
     assert not support.same_bits(one, before)

@@ -22,20 +22,31 @@ NAMES = json.loads((Path(DATA) / "reference.json").read_text()) if DATA else {}
 """Reference values by problem; empty without data."""
 
 CERES = {
-    LADYBUG: """850912.460681 46481.9269255 14817.5184734 13460.2922064 13433.0371704 13388.7630645 13375.5073385
-        13365.9638953 13360.4877081 13356.5052437 13353.6010514 13351.4119035 13349.7594793 13348.5082624 13347.5567682
-        13346.8286788 13346.2678405 13345.8332324 13345.494735 13345.2299908 13345.0222184 13344.8587053 13344.7297468
-        13344.6291413 13344.5512564 13344.4904052 13344.4421992 13344.4041423 13344.3744504 13344.3512348 13344.3326215
+    LADYBUG: """850912.460681 46481.9269255 14817.5184734 13460.2922064 13433.0371704
+        13388.7630645 13375.5073385 13365.9638953 13360.4877081 13356.5052437
+        13353.6010514 13351.4119035 13349.7594793 13348.5082624 13347.5567682
+        13346.8286788 13346.2678405 13345.8332324 13345.494735 13345.2299908 13345.0222184
+        13344.8587053 13344.7297468 13344.6291413 13344.5512564 13344.4904052
+        13344.4421992 13344.4041423 13344.3744504 13344.3512348 13344.3326215
         13344.3183995""",
-    TRAFALGAR: """4413239.31443 35425.1360774 31180.9767948 30515.8079156 30424.1464789 30388.7317701 30379.3905723
-        30378.6460692""",
+    TRAFALGAR: """4413239.31443 35425.1360774 31180.9767948 30515.8079156 30424.1464789
+        30388.7317701 30379.3905723 30378.6460692""",
 }
-"""Costs after each iteration, the start first: Ceres 2.1.0, DENSE_SCHUR, ftol 1e-6. Ceres does not take the step whose
-decrease is within ftol, jaxba takes it and counts it."""
+"""Costs after each iteration, the start first: Ceres 2.1.0, DENSE_SCHUR, ftol 1e-6. Ceres does not
+take the step whose decrease is within ftol, jaxba takes it and counts it."""
 
 CERES_LAMBDAS = {
     LADYBUG: [1e-4, 1e-4 / 3, 1e-4 / 9, 1e-4 / 27, 3.793e-6, 3.071e-6, 2.993e-6, 2.497e-6],
-    TRAFALGAR: [1e-4, 1e-4 / 3, 1.75154e-5, 5.83848e-6, 2.29447e-6, 1.12572e-6, 3.75241e-7, 1.2508e-7],
+    TRAFALGAR: [
+        1e-4,
+        1e-4 / 3,
+        1.75154e-5,
+        5.83848e-6,
+        2.29447e-6,
+        1.12572e-6,
+        3.75241e-7,
+        1.2508e-7,
+    ],
 }
 """1 / radius before each step."""
 
@@ -57,7 +68,10 @@ def solved():
         if key not in done:
             problem = read_problem(path(name))
             done[key] = solve(
-                problem, damping, StepOptions(refinement=Refinement(points=refine_points)), callback=lambda record: None
+                problem,
+                damping,
+                StepOptions(refinement=Refinement(points=refine_points)),
+                callback=lambda record: None,
             )
         return done[key]
 
@@ -78,8 +92,9 @@ def test_initial_cost_is_that_of_ceres(name):
 
 @pytest.mark.parametrize("name", [LADYBUG, TRAFALGAR])
 def test_ceres_rule_walks_the_path_of_ceres(name, solved):
-    """Five costs to seven digits, all of them to five: late on Ladybug lambda is 1e-8 and what little it adds differs,
-    since Ceres clamps the diagonal after scaling the columns and jaxba before."""
+    """Five costs to seven digits, all of them to five: late on Ladybug lambda is 1e-8 and what
+    little it adds differs, since Ceres clamps the diagonal after scaling the columns and jaxba
+    before."""
     solution = solved(name, "ceres")
     expected = np.array(CERES[name].split(), float)
     costs = np.append(solution.initial_cost, solution.history.cost)[: len(expected)]

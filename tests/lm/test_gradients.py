@@ -1,8 +1,9 @@
-"""Derivatives of a step by cameras, points, observations and lambda, both ways, against finite differences.
+"""Derivatives of a step by cameras, points, observations and lambda, both ways, against finite
+differences.
 
-Scenes have what makes derivatives NaN where values are fine: a camera in the origin without rotation, observation slots
-and points that are empty, observations of no weight, points behind a camera, cameras that nobody observes.
-"""
+Scenes have what makes derivatives NaN where values are fine: a camera in the origin without
+rotation, observation slots and points that are empty, observations of no weight, points behind a
+camera, cameras that nobody observes."""
 
 from __future__ import annotations
 
@@ -14,7 +15,16 @@ import numpy as np
 import pytest
 import support
 
-from jaxba import BundleProblem, Lenses, Loss, StepOptions, build_layout, initial_state, lm_step, random_scene
+from jaxba import (
+    BundleProblem,
+    Lenses,
+    Loss,
+    StepOptions,
+    build_layout,
+    initial_state,
+    lm_step,
+    random_scene,
+)
 from jaxba.linear.cholesky import lower_cholesky
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
@@ -32,19 +42,27 @@ TO_THE_END = ConjugateGradients(forcing=0.0, tolerance=1e-14, max_iterations=500
 
 
 def in_first_camera(problem: BundleProblem) -> BundleProblem:
-    """The same scene in the coordinates of camera 0, which then stands in the origin without rotation."""
-    rotations, translations = geometry.rotation_matrices(problem.cameras[:, :3]), problem.cameras[:, 3:6]
+    """The same scene in the coordinates of camera 0, which then stands in the origin without
+    rotation."""
+    rotations, translations = (
+        geometry.rotation_matrices(problem.cameras[:, :3]),
+        problem.cameras[:, 3:6],
+    )
     turned = rotations @ rotations[0].T
     cameras = np.array(problem.cameras)
     cameras[:, :3] = geometry.angle_axis(turned)
     cameras[:, 3:6] = translations - turned @ translations[0]
     cameras[0, :6] = 0
-    return problem.replace(cameras=cameras, points=problem.points @ rotations[0].T + translations[0])
+    return problem.replace(
+        cameras=cameras, points=problem.points @ rotations[0].T + translations[0]
+    )
 
 
 def sequence() -> BundleProblem:
     """Cameras in a row, each of which sees its neighbours' points only: a band."""
-    return random_scene(SceneConfig(70, 150, 600, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
+    return random_scene(
+        SceneConfig(70, 150, 600, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0
+    )
 
 
 def shared() -> BundleProblem:
@@ -74,16 +92,25 @@ FACTORED = {
     "manifold": (support.tiny, StepOptions(coordinates=Coordinates(rotation="manifold")), own_size),
     "tukey": (support.odd, StepOptions(loss=Loss("tukey", 8.0)), own_size),
     # jax.scipy's conjugate gradients have the derivatives of the solution, in both modes
-    "cg": (support.tiny, StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=120)), own_size),
+    "cg": (
+        support.tiny,
+        StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=120)),
+        own_size,
+    ),
 }
 WITH_LOOPS = {
-    "implicit": (support.tiny, StepOptions(linear_solver="implicit", conjugate_gradients=TO_THE_END), own_size),
+    "implicit": (
+        support.tiny,
+        StepOptions(linear_solver="implicit", conjugate_gradients=TO_THE_END),
+        own_size,
+    ),
     "padded-pairs": (support.odd, PLAIN, padded),
 }
 
 
 def as_function(make, options: StepOptions, lay_out):
-    """The step as a function of cameras, points, pixels and lambda, to all its numbers by name; and where it starts."""
+    """The step as a function of cameras, points, pixels and lambda, to all its numbers by name; and
+    where it starts."""
     layout, given = lay_out(in_first_camera(make()), options)
     state = initial_state(layout, given, options, jnp.float64)
     assert np.any(np.all(np.asarray(state.cameras[:6]) == 0, axis=0))
@@ -93,9 +120,15 @@ def as_function(make, options: StepOptions, lay_out):
     def step(cameras, points, pixels, damping):
         before = state._replace(cameras=cameras, points=points)
         after, info = lm_step(replace(layout, pixels=pixels), before, damping, options)
-        numbers = {name: x for name, x in info._asdict().items() if jnp.issubdtype(x.dtype, jnp.floating)}
+        numbers = {
+            name: x for name, x in info._asdict().items() if jnp.issubdtype(x.dtype, jnp.floating)
+        }
         kinds = {"rotations": slice(0, 3), "translations": slice(3, 6), "intrinsics": slice(6, 9)}
-        return {**numbers, "points": after.points, **{kind: after.cameras[rows] for kind, rows in kinds.items()}}
+        return {
+            **numbers,
+            "points": after.points,
+            **{kind: after.cameras[rows] for kind, rows in kinds.items()},
+        }
 
     return step, (
         state.cameras,
@@ -106,7 +139,8 @@ def as_function(make, options: StepOptions, lay_out):
 
 
 def directions(at, seed: int = 0):
-    """For each argument a random direction of the size of its numbers, the other arguments unchanged."""
+    """For each argument a random direction of the size of its numbers, the other arguments
+    unchanged."""
     rng = np.random.default_rng(seed)
     for k, argument in enumerate(at):
         size = np.abs(argument).max(axis=-1, keepdims=True) if argument.ndim else argument
@@ -116,17 +150,22 @@ def directions(at, seed: int = 0):
 
 def differences(function, at, direction, width: float):
     """Central differences of fourth order."""
-    value = lambda scale: function(*(x + scale * width * d for x, d in zip(at, direction, strict=True)))
+    value = lambda scale: function(
+        *(x + scale * width * d for x, d in zip(at, direction, strict=True))
+    )
     near, far = ([value(sign * scale) for sign in (1, -1)] for scale in (1, 2))
     slope = lambda a, b, c, d: (8 * (a - b) - (c - d)) / (12 * width)
     return jax.tree.map(slope, *near, *far)
 
 
 def rounding_of(function, at, values) -> dict:
-    """How far each number moves where the arguments move in their last digits: what rounding alone may change it by."""
+    """How far each number moves where the arguments move in their last digits: what rounding alone
+    may change it by."""
     moved = [function(*(x * (1 + sign * 2 * np.finfo(float).eps) for x in at)) for sign in (-1, 1)]
     size = lambda x: 3e-15 * np.linalg.norm(x)
-    return {k: size(x) + max(np.linalg.norm(other[k] - x) for other in moved) for k, x in values.items()}
+    return {
+        k: size(x) + max(np.linalg.norm(other[k] - x) for other in moved) for k, x in values.items()
+    }
 
 
 def check_forward(function, at, width: float = 3e-7) -> None:
@@ -137,7 +176,12 @@ def check_forward(function, at, width: float = 3e-7) -> None:
         for name, slope in found.items():
             assert np.isfinite(slope).all(), name
             error, size = np.linalg.norm(slope - expected[name]), np.linalg.norm(slope)
-            assert error <= 1e-5 * size + 4 * rounding[name] / width, (name, error, size, rounding[name] / width)
+            assert error <= 1e-5 * size + 4 * rounding[name] / width, (
+                name,
+                error,
+                size,
+                rounding[name] / width,
+            )
 
 
 @pytest.mark.slow
@@ -146,24 +190,31 @@ def test_forward_derivatives_are_finite_and_those_of_differences(name):
     check_forward(*as_function(*{**FACTORED, **WITH_LOOPS}[name]))
 
 
-# backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of each
+# backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of
+# each
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["dense", "shared-lenses", "cg"])
 def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(name):
     function, at = as_function(*FACTORED[name])
     rng = np.random.default_rng(1)
-    weights = {k: jnp.asarray(rng.normal(size=x.shape) / (1 + np.abs(x).max())) for k, x in function(*at).items()}
+    weights = {
+        k: jnp.asarray(rng.normal(size=x.shape) / (1 + np.abs(x).max()))
+        for k, x in function(*at).items()
+    }
     total = lambda *at: sum(jnp.sum(weights[k] * x) for k, x in function(*at).items())
     gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*at)
     assert all(np.isfinite(x).all() for x in gradient)
     forward = jax.jit(lambda direction: jax.jvp(total, at, direction)[1])
     for direction in directions(at, seed=2):
         by_parts = [np.sum(g * d) for g, d in zip(gradient, direction, strict=True)]
-        size = sum(np.linalg.norm(g) * np.linalg.norm(d) for g, d in zip(gradient, direction, strict=True))
+        size = sum(
+            np.linalg.norm(g) * np.linalg.norm(d) for g, d in zip(gradient, direction, strict=True)
+        )
         assert abs(forward(direction) - sum(by_parts)) <= 1e-9 * size
 
 
-@pytest.mark.fully_compiled  # without LLVM's optimisation XLA's older emitters get a batch of derivatives wrong
+# without LLVM's optimisation XLA's older emitters get a batch of derivatives wrong
+@pytest.mark.fully_compiled
 @pytest.mark.slow
 def test_the_jacobian_is_made_of_forward_derivatives():
     function, at = as_function(*FACTORED["dense"])
@@ -175,7 +226,8 @@ def test_the_jacobian_is_made_of_forward_derivatives():
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", ["squared", "tukey"])
 def test_nothing_is_nan_where_the_residuals_or_all_weights_are_zero(loss):
-    """At zero residuals the step is zero, too; far beyond the scale of a loss most or all of the weights are."""
+    """At zero residuals the step is zero, too; far beyond the scale of a loss most or all of the
+    weights are."""
     problem = in_first_camera(support.tiny())
     exact = problem.replace(observations=geometry.project(problem))
     pixels = jnp.asarray(build_layout(exact, PLAIN).pixels)
@@ -197,7 +249,9 @@ def test_the_derivative_of_a_factor_reads_the_lower_triangle_alone():
     change = rng.normal(size=matrix.shape)
     whole = np.tril(change) + np.tril(change, -1).transpose(0, 2, 1)
     found = jax.jvp(lower_cholesky, (jnp.asarray(np.tril(matrix)),), (jnp.asarray(change),))[1]
-    expected = (np.linalg.cholesky(matrix + 1e-6 * whole) - np.linalg.cholesky(matrix - 1e-6 * whole)) / 2e-6
+    expected = (
+        np.linalg.cholesky(matrix + 1e-6 * whole) - np.linalg.cholesky(matrix - 1e-6 * whole)
+    ) / 2e-6
     np.testing.assert_allclose(found, expected, atol=1e-7)
     backwards = jax.grad(lambda m: jnp.sum(lower_cholesky(m) ** 3))(jnp.asarray(matrix))
     assert (np.triu(backwards, 1) == 0).all()

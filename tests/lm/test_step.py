@@ -1,4 +1,5 @@
-"""One Levenberg-Marquardt step against dense float64 algebra, and what happens to steps that must be rejected."""
+"""One Levenberg-Marquardt step against dense float64 algebra, and what happens to steps that must
+be rejected."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ UNTIL_NOTHING_CHANGES = ConjugateGradients(forcing=0.0, tolerance=1e-14, max_ite
 TO_THE_END = StepOptions(linear_solver="implicit", conjugate_gradients=UNTIL_NOTHING_CHANGES)
 
 KINDS = {
-    f"{solver}-{rotation}-{scaling}": replace(options, coordinates=Coordinates(scaling=scaling, rotation=rotation))
+    f"{solver}-{rotation}-{scaling}": replace(
+        options, coordinates=Coordinates(scaling=scaling, rotation=rotation)
+    )
     for solver, options in (("explicit", EXACT), ("implicit", TO_THE_END))
     for rotation in ("angle-axis", "manifold")
     for scaling in ("diagonal", "identity")
@@ -29,9 +32,13 @@ KINDS = {
 SOLVERS = {
     "sparse": replace(TO_THE_END, linear_solver="sparse"),
     "cg": StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=200)),
-    "implicit-jacobi": replace(TO_THE_END, conjugate_gradients=replace(UNTIL_NOTHING_CHANGES, preconditioner="jacobi")),
+    "implicit-jacobi": replace(
+        TO_THE_END, conjugate_gradients=replace(UNTIL_NOTHING_CHANGES, preconditioner="jacobi")
+    ),
 }
-LOSSES = {name: replace(EXACT, loss=Loss(name, 1.7)) for name in ("huber", "soft_l1", "cauchy", "tukey")}
+LOSSES = {
+    name: replace(EXACT, loss=Loss(name, 1.7)) for name in ("huber", "soft_l1", "cauchy", "tukey")
+}
 PROBLEMS = {
     "paper-0": lambda: support.paper(0),
     "odd": support.odd,
@@ -45,7 +52,12 @@ REPEATING = (
 
 CASES = [
     *(
-        pytest.param(support.tiny, options, id=f"tiny-{kind}", marks=pytest.mark.slow if kind in REPEATING else ())
+        pytest.param(
+            support.tiny,
+            options,
+            id=f"tiny-{kind}",
+            marks=pytest.mark.slow if kind in REPEATING else (),
+        )
         for kind, options in {**KINDS, **SOLVERS, **LOSSES}.items()
     ),
     *(pytest.param(make, EXACT, id=name) for name, make in PROBLEMS.items()),
@@ -54,7 +66,11 @@ CASES = [
     pytest.param(support.odd, SOLVERS["sparse"], id="odd-sparse", marks=pytest.mark.slow),
     pytest.param(support.odd, SOLVERS["cg"], id="odd-cg", marks=pytest.mark.slow),
     pytest.param(support.whitened, EXACT, id="whitened"),
-    pytest.param(support.whitened, replace(TO_THE_END, loss=Loss("cauchy", 0.8)), id="whitened-implicit-cauchy"),
+    pytest.param(
+        support.whitened,
+        replace(TO_THE_END, loss=Loss("cauchy", 0.8)),
+        id="whitened-implicit-cauchy",
+    ),
     *(
         pytest.param(
             lambda name=name: read_bal(bal_file(name)),
@@ -88,17 +104,31 @@ def sixty_four():
 
 def test_a_batch_of_steps_equals_a_loop_of_steps(sixty_four):
     pairs, (layouts, states), dampings = sixty_four
-    batched = jax.jit(jax.vmap(lambda layout, state, damping: lm_step(layout, state, damping, EXACT)))
+    batched = jax.jit(
+        jax.vmap(lambda layout, state, damping: lm_step(layout, state, damping, EXACT))
+    )
     together = batched(layouts, states, dampings)
-    apart = [step(layout, state, damping, EXACT) for (layout, state), damping in zip(pairs, dampings, strict=True)]
+    apart = [
+        step(layout, state, damping, EXACT)
+        for (layout, state), damping in zip(pairs, dampings, strict=True)
+    ]
     apart = jax.tree.map(lambda *leaves: np.stack(leaves), *apart)
     assert 0 < np.sum(together[1].accepted) <= 64
     np.testing.assert_array_equal(together[1].accepted, apart[1].accepted)
     for one, other in zip(jax.tree.leaves(together[0]), jax.tree.leaves(apart[0]), strict=True):
         size = np.abs(other).max(axis=tuple(range(1, other.ndim)), keepdims=True)
         assert (np.abs(one - other) <= 1e-10 * size).all()
-    for name in ("cost", "candidate_cost", "predicted", "gradient_max", "step_norm", "parameter_norm"):
-        np.testing.assert_allclose(getattr(together[1], name), getattr(apart[1], name), rtol=1e-10, err_msg=name)
+    for name in (
+        "cost",
+        "candidate_cost",
+        "predicted",
+        "gradient_max",
+        "step_norm",
+        "parameter_norm",
+    ):
+        np.testing.assert_allclose(
+            getattr(together[1], name), getattr(apart[1], name), rtol=1e-10, err_msg=name
+        )
 
 
 # Compilation
@@ -130,7 +160,9 @@ def test_shapes_depend_on_sizes_alone_for_scenes_where_all_is_visible():
 
 
 @pytest.mark.parametrize("damping", [np.nan, np.inf, -np.inf, -2.0])
-@pytest.mark.parametrize("options", [EXACT, replace(EXACT, linear_solver="implicit")], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(
+    "options", [EXACT, replace(EXACT, linear_solver="implicit")], ids=["explicit", "implicit"]
+)
 def test_a_damping_without_meaning_is_a_rejected_step_that_changes_no_bit(options, damping):
     layout, before = start(support.tiny(), options)
     after, info = step(layout, before, damping, options)
@@ -139,10 +171,12 @@ def test_a_damping_without_meaning_is_a_rejected_step_that_changes_no_bit(option
     assert info.cost == before.cost == info.previous_cost
 
 
-@pytest.mark.parametrize("damping", [0.0, 1e-300, 1e-18, 1e-14, 1e-10, 1e-6, 1e-2, 1e2, 1e6, 1e20, 1e300])
+@pytest.mark.parametrize(
+    "damping", [0.0, 1e-300, 1e-18, 1e-14, 1e-10, 1e-6, 1e-2, 1e2, 1e6, 1e20, 1e300]
+)
 def test_no_damping_lets_the_cost_rise_or_a_nan_in(damping):
-    """At zero the seven gauge freedoms leave the system singular: whatever the factorisation makes of it. At 1e20 a
-    step is so short that costs fall by less than what their sum is rounded by."""
+    """At zero the seven gauge freedoms leave the system singular: whatever the factorisation makes
+    of it. At 1e20 a step is so short that costs fall by less than what their sum is rounded by."""
     for problem in (support.tiny(), support.odd(), support.single(), support.whitened()):
         layout, before = start(problem)
         after, info = step(layout, before, damping, EXACT)
@@ -157,8 +191,11 @@ def test_no_damping_lets_the_cost_rise_or_a_nan_in(damping):
 
 @pytest.mark.parametrize("refine_points", [0, 3])
 def test_a_candidate_that_overflows_is_a_rejected_step(refine_points):
-    """A pixel at 1e150 asks for steps of that size, and the distortion raises them to the fifth power."""
-    problem = BundleProblem.create([[0, 0, 0, 0, 0, 0, 1.0, 0.0, 1.0]], [[0.1, 0, -1]], [[1e150, 0]], [0], [0])
+    """A pixel at 1e150 asks for steps of that size, and the distortion raises them to the fifth
+    power."""
+    problem = BundleProblem.create(
+        [[0, 0, 0, 0, 0, 0, 1.0, 0.0, 1.0]], [[0.1, 0, -1]], [[1e150, 0]], [0], [0]
+    )
     options = StepOptions(refinement=Refinement(points=refine_points))
     layout, before = start(problem, options)
     assert np.isfinite(before.cost)
@@ -171,7 +208,9 @@ def test_a_candidate_that_overflows_is_a_rejected_step(refine_points):
 def test_a_start_that_is_not_finite_stays_as_it_is():
     """A point on its camera's plane."""
     problem = support.single()
-    on_plane = problem.replace(cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]]))
+    on_plane = problem.replace(
+        cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]])
+    )
     layout, before = start(on_plane)
     assert not np.isfinite(before.cost)
     after, info = step(layout, before, 1e-4, EXACT)
@@ -186,7 +225,10 @@ def test_a_start_that_is_not_finite_stays_as_it_is():
         # conjugate gradients repair an exact solve
         pytest.param({"mixed_precision": True}, 0.0, marks=pytest.mark.slow),
         ({"linear_solver": "sparse"}, 0.1),
-        ({"linear_solver": "implicit", "conjugate_gradients": ConjugateGradients(forcing=0.02)}, 0.02),
+        (
+            {"linear_solver": "implicit", "conjugate_gradients": ConjugateGradients(forcing=0.02)},
+            0.02,
+        ),
         ({"method": make_method("deeplm")}, 1e-3),
         pytest.param({"method": make_method("stba")}, 0.0, marks=pytest.mark.slow),
     ],
@@ -203,7 +245,12 @@ def test_a_step_is_taken_only_if_its_gain_exceeds_the_threshold():
     _, info = step(layout, before, 1e-2, EXACT, 0.0)
     gain = float(info.gain_ratio)
     assert 0.5 < gain < 2
-    for threshold, expected in ((gain * (1 - 1e-9), True), (gain, False), (gain * (1 + 1e-9), False), (np.nan, False)):
+    for threshold, expected in (
+        (gain * (1 - 1e-9), True),
+        (gain, False),
+        (gain * (1 + 1e-9), False),
+        (np.nan, False),
+    ):
         after, info = step(layout, before, 1e-2, EXACT, threshold)
         assert bool(info.accepted) == expected
         assert same_bits(after, before) != expected

@@ -45,7 +45,9 @@ def test_the_undamped_decrease_is_told_exactly_on_a_parabola(curvature, damping,
 
 @settings(deadline=None)
 @given(positive, st.floats(1e-6, 1e5), positive, st.floats(-9, -3), st.floats(-4, 4))
-def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, damping, gradient, digits, over):
+def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(
+    curvature, damping, gradient, digits, over
+):
     """`over`: decades by which the cost times ftol exceeds the decrease."""
     decrease, undamped, share = quadratic_step(curvature, damping, gradient)
     ftol = 10.0**digits
@@ -53,7 +55,8 @@ def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, d
     for edge in (decrease / (ftol * cost), undamped / (MAX_UNDAMPED_RATIO * ftol * cost)):
         if abs(edge - 1) < 1e-4:
             return  # rounding decides
-    if cost - decrease <= 0 or decrease < 1e-11 * cost:  # no cost is negative, nor is a decrease below its last digits
+    # no cost is negative, nor is a decrease below its last digits
+    if cost - decrease <= 0 or decrease < 1e-11 * cost:
         return
     info = step_info(True, cost=cost - decrease, previous_cost=cost, damping_fraction=share)
     expected = decrease <= ftol * cost and undamped <= MAX_UNDAMPED_RATIO * ftol * cost
@@ -62,7 +65,9 @@ def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, d
 
 @settings(deadline=None)
 @given(positive, st.floats(1e-6, 1e5), positive, st.floats(1e-9, 1e9))
-def test_the_estimated_distance_to_the_end_is_not_too_small_on_a_parabola(curvature, damping, gradient, end):
+def test_the_estimated_distance_to_the_end_is_not_too_small_on_a_parabola(
+    curvature, damping, gradient, end
+):
     """`end` is the cost at the minimum."""
     decrease, undamped, share = quadratic_step(curvature, damping, gradient)
     before, after = end + undamped, end + undamped - decrease
@@ -76,7 +81,9 @@ def test_of_what_comes_after_a_rejected_or_shortened_step_nothing_is_known():
     assert not np.isfinite(distance_to_end(step_info(False, cost=1.0, previous_cost=1.0)))
     assert not np.isfinite(distance_to_end(step_info(True, step_fraction=0.25)))
     assert distance_to_end(step_info(True, cost=1.0, previous_cost=2.0)) == LEAST_LEFT
-    steps = step_info(True, cost=1.0, previous_cost=2.0, damping_fraction=np.array([1e-9, 1e-4, 1e-2, 0.5]))
+    steps = step_info(
+        True, cost=1.0, previous_cost=2.0, damping_fraction=np.array([1e-9, 1e-4, 1e-2, 0.5])
+    )
     assert (np.diff(distance_to_end(steps)[1:]) > 0).all()
 
 
@@ -103,27 +110,37 @@ def test_a_rejected_step_never_ends_a_solve_as_converged():
     assert int(code) == Termination.RUNNING
 
 
-@pytest.mark.parametrize(("share", "ends"), [(0.0, True), (0.9, True), (0.999999, False), (1.0, False)])
+@pytest.mark.parametrize(
+    ("share", "ends"), [(0.0, True), (0.9, True), (0.999999, False), (1.0, False)]
+)
 def test_the_same_small_decrease_ends_a_solve_or_not_by_what_made_it_small(share, ends):
     info = step_info(True, cost=1 - 5e-7, previous_cost=1.0, damping_fraction=share)
     assert bool(converged_in_cost(info, 1e-6)) == ends
 
 
 def test_no_decrease_at_all_is_convergence_whatever_lambda_was():
-    """Then the undamped step promises nothing either; without this a solve at the exact minimum would never end."""
-    assert converged_in_cost(step_info(True, cost=1.0, previous_cost=1.0, damping_fraction=0.999), 1e-6)
+    """Then the undamped step promises nothing either; without this a solve at the exact minimum
+    would never end."""
+    assert converged_in_cost(
+        step_info(True, cost=1.0, previous_cost=1.0, damping_fraction=0.999), 1e-6
+    )
 
 
 def single(**fields):
     """A refused step in float32."""
-    info = step_info(False, **{"cost": 1.0, "previous_cost": 1.0, "predicted": 5e-7, "damping_fraction": 0.0} | fields)
+    info = step_info(
+        False,
+        **{"cost": 1.0, "previous_cost": 1.0, "predicted": 5e-7, "damping_fraction": 0.0} | fields,
+    )
     return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, info)
 
 
-def test_a_refused_step_ends_a_solve_in_float32_where_its_promise_drowns_in_the_rounding_of_the_cost():
+def test_in_float32_a_refused_step_ends_a_solve_if_its_promise_is_below_rounding():
     info = single()
     assert lost_in_rounding(info)
-    code = termination_of(info, jnp.asarray(False), jnp.asarray(3, jnp.int32), Tolerances(ftol=1e-12), 100)
+    code = termination_of(
+        info, jnp.asarray(False), jnp.asarray(3, jnp.int32), Tolerances(ftol=1e-12), 100
+    )
     assert int(code) == Termination.ROUNDING
 
 
@@ -171,7 +188,8 @@ def test_a_huge_lambda_does_not_feign_convergence_and_ceres_rule_converges():
     stuck = solve(problem, "constant:1e6", max_iterations=LIMIT, tolerances=ftol_alone)
     costs = np.concatenate([[stuck.initial_cost], stuck.history.cost])
     assert stuck.accepted > 0
-    assert (-np.diff(costs) <= 1e-5 * costs[:-1]).all()  # each alone would have ended it by the plain rule
+    # each alone would have ended it by the plain rule
+    assert (-np.diff(costs) <= 1e-5 * costs[:-1]).all()
     assert stuck.termination == Termination.MAX_ITERATIONS
     fine = solve(problem, "ceres", max_iterations=LIMIT, tolerances=ftol_alone)
     assert fine.termination == Termination.COST

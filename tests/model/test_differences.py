@@ -1,4 +1,5 @@
-"""Derivatives are compared with differences alike wherever a scene is, and wrong ones are refused everywhere."""
+"""Derivatives are compared with differences alike wherever a scene is, and wrong ones are refused
+everywhere."""
 
 from __future__ import annotations
 
@@ -79,14 +80,18 @@ def test_a_function_may_bend_within_a_small_part_of_the_scene(gap):
 @pytest.mark.parametrize("origin", ORIGINS)
 def test_wrong_derivatives_are_refused_wherever_the_scene_is(origin, unchecked):
     rows = lying_distance(point=EACH, point_2=EACH + 1, length=1.0)
-    with pytest.raises(jaxba.ProblemError, match="lying_distance do not agree with differences: by point"):
+    with pytest.raises(
+        jaxba.ProblemError, match="lying_distance do not agree with differences: by point"
+    ):
         jaxba.with_residual(scene(origin), rows)
 
 
 def test_a_wrong_derivative_by_what_moves_little_is_refused(unchecked):
     problem = scene()
     rows = lying_block(pose=EACH, offset=EACH, measured=np.zeros((1, 3)))
-    with pytest.raises(jaxba.ProblemError, match="lying_block do not agree with differences: by offset"):
+    with pytest.raises(
+        jaxba.ProblemError, match="lying_block do not agree with differences: by offset"
+    ):
         jaxba.with_residual(problem, rows, unknowns={"offset": np.ones((problem.num_cameras, 3))})
 
 
@@ -103,7 +108,9 @@ def test_where_rotations_jump_only_wrong_derivatives_are_refused(origin, uncheck
     measured = half_a_turn_away(problem) | {"whitening": np.eye(6)[None]}
     index = {"pose": EACH, "pose_2": EACH + 1}
     assert jaxba.with_residual(problem, residuals.relative_pose(**index, **measured)).residuals
-    with pytest.raises(jaxba.ProblemError, match="lying_pose do not agree with differences: by pose"):
+    with pytest.raises(
+        jaxba.ProblemError, match="lying_pose do not agree with differences: by pose"
+    ):
         jaxba.with_residual(problem, lying_pose(**index, **measured))
 
 

@@ -1,4 +1,5 @@
-"""Sums over each point's observations: the same as sums of dense Jacobians, in one loop or compiled fast."""
+"""Sums over each point's observations: the same as sums of dense Jacobians, in one loop or compiled
+fast."""
 
 from __future__ import annotations
 
@@ -39,7 +40,9 @@ def two_tracks() -> BundleProblem:
     )
 
 
-def sums(layout: Layout, problem: BundleProblem, loss: Loss, fast: bool, dtype: str = "float64") -> np.ndarray:
+def sums(
+    layout: Layout, problem: BundleProblem, loss: Loss, fast: bool, dtype: str = "float64"
+) -> np.ndarray:
     """The eleven sums that point iterations need, as [sum, point of the problem]."""
 
     def found(layout, problem):
@@ -90,7 +93,9 @@ def test_a_padded_layout_gives_the_same_sums():
     layout = build_layout(problem, capacity=capacity_of(problem))
     assert layout.point_levels is not None
     scale = np.abs(truth).max(axis=0) + 1e-300
-    np.testing.assert_allclose(sums(layout, problem, Loss(), False)[:10] / scale, truth / scale, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        sums(layout, problem, Loss(), False)[:10] / scale, truth / scale, rtol=0, atol=1e-12
+    )
 
 
 def test_the_problem_of_these_tests_has_several_buckets():
@@ -101,7 +106,9 @@ def test_the_problem_of_these_tests_has_several_buckets():
 def test_a_pass_in_float32_loses_no_more_than_rounding(fast):
     problem = two_tracks()
     layout = build_layout(problem)
-    exact, found = (sums(layout, problem, Loss(), fast, dtype)[:10] for dtype in ("float64", "float32"))
+    exact, found = (
+        sums(layout, problem, Loss(), fast, dtype)[:10] for dtype in ("float64", "float32")
+    )
     # the cost and the gradient are sums of terms with residuals, which are differences of pixels
     scale = np.abs(exact).max(axis=0)
     assert (np.abs(found - exact)[:, scale > 0] / scale[scale > 0]).max() < 1e-3
@@ -129,9 +136,9 @@ def test_point_iterations_are_the_same_in_fast_compilation(loss):
     def found(fast: bool):
         with fast_compilation(fast):
             frames = slot_frames(layout, state.cameras)
-            return jax.jit(lambda layout, points: refine_points(layout, state.cameras, frames, points, loss, 3))(
-                layout, state.points
-            )
+            return jax.jit(
+                lambda layout, points: refine_points(layout, state.cameras, frames, points, loss, 3)
+            )(layout, state.points)
 
     (points, costs), (stored_points, stored_costs) = found(False), found(True)
     np.testing.assert_allclose(points, stored_points, rtol=1e-7, atol=1e-7)
@@ -148,7 +155,9 @@ def test_many_scenes_at_once_get_what_each_gets_alone():
         one_pass = point_passes(layout, slot_frames(layout, state.cameras))
         return jnp.stack(one_pass(state.points, lambda views: point_terms(views, Loss())))
 
-    stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+    stack = lambda trees: jax.tree.map(
+        lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees
+    )
     together = jax.jit(jax.vmap(found))(stack(layouts), stack(problems))
     one = jax.jit(found)
     alone = [one(layout, problem) for layout, problem in zip(layouts, problems, strict=True)]

@@ -1,4 +1,5 @@
-"""Agents of the reproduction run: their settings, the scenes that are kept for the tables, and fixed lenses."""
+"""Agents of the reproduction run: their settings, the scenes that are kept for the tables, and
+fixed lenses."""
 
 from __future__ import annotations
 
@@ -9,7 +10,15 @@ from support import paper, solve
 
 from jaxba import StepOptions, settings
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, held_out_count, make_split
+from jaxba.game.scene_bank import (
+    EASY_ENOUGH,
+    MAX_RATIO,
+    MIN_RATIO,
+    BankConfig,
+    Split,
+    held_out_count,
+    make_split,
+)
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
 from jaxba.paper.tables_and_figures.figures import small_scene
@@ -35,7 +44,9 @@ def test_agents_differ_only_in_the_settings_that_their_table_compares(agent, cha
 
 
 def test_all_kinds_of_agents_are_trained_on_the_same_scenes_side_by_side():
-    printed, ours, best = (agents.train_config(CONFIG, one) for one in (agents.PRINTED, agents.OURS, agents.BEST))
+    printed, ours, best = (
+        agents.train_config(CONFIG, one) for one in (agents.PRINTED, agents.OURS, agents.BEST)
+    )
     assert printed.bank == ours.bank == best.bank
     assert printed.seeds == ours.seeds == best.seeds == CONFIG.agents.seeds
     whole = load(agents.BEST.preset)
@@ -45,9 +56,19 @@ def test_all_kinds_of_agents_are_trained_on_the_same_scenes_side_by_side():
 
 def test_ours_is_the_papers_agent():
     found = agents.train_config(CONFIG, agents.PRINTED)
-    assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "constant")
-    assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (10.0, 500, "value", 256)
-    assert (found.sac.layers, found.sac.policy_layers) == (2, 3)  # and a linear one: three and four fully connected
+    assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == (
+        "paper",
+        5,
+        "constant",
+    )
+    assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (
+        10.0,
+        500,
+        "value",
+        256,
+    )
+    # and a linear one: three and four fully connected
+    assert (found.sac.layers, found.sac.policy_layers) == (2, 3)
     assert found.bank.kind == SceneClass(10, 10, "paper")
     assert found.bank.intrinsics == "fixed"
     assert found.game.max_iterations == 100
@@ -66,11 +87,17 @@ def split() -> Split:
 def test_held_out_scenes_are_not_training_scenes(split):
     train, held_out = (set(map(bytes, np.asarray(bank.scenes.pixels))) for bank in split)
     assert len(train) == len(split.train.initial_cost)
-    assert len(held_out) == len(split.held_out.initial_cost) == held_out_count(len(train) + len(held_out))
+    assert (
+        len(held_out)
+        == len(split.held_out.initial_cost)
+        == held_out_count(len(train) + len(held_out))
+    )
     assert not train & held_out
 
 
-@pytest.mark.parametrize(("usable", "held"), [(1, 1), (60, 20), (600, 200), (900, 200), (4572, 457)])
+@pytest.mark.parametrize(
+    ("usable", "held"), [(1, 1), (60, 20), (600, 200), (900, 200), (4572, 457)]
+)
 def test_a_tenth_is_held_out_or_two_hundred_scenes_but_no_more_than_a_third(usable, held):
     assert held_out_count(usable) == held
 
@@ -81,14 +108,17 @@ def test_scenes_are_neither_solved_at_the_start_nor_unsolvable(split):
         ratio = np.asarray(bank.initial_cost) / np.asarray(bank.best_cost)
         assert (ratio > MIN_RATIO).all()
         assert (ratio < MAX_RATIO).all()
-        assert (np.asarray(bank.ceres_iterations) <= EASY_ENOUGH).all()  # the portfolio has only this rule
+        # the portfolio has only this rule
+        assert (np.asarray(bank.ceres_iterations) <= EASY_ENOUGH).all()
 
 
 @pytest.mark.slow
 def test_the_scenes_of_the_tables_are_not_used_in_training(split, monkeypatch, tmp_path):
     monkeypatch.setattr(agents, "_shared_scenes", lambda *_: split)
     train_on, test = agents.scenes(CONFIG, tmp_path, lambda _: None)
-    costs = [set(np.asarray(bank.initial_cost).tolist()) for bank in (train_on, test, split.held_out)]
+    costs = [
+        set(np.asarray(bank.initial_cost).tolist()) for bank in (train_on, test, split.held_out)
+    ]
     assert len(costs[1]) == len(costs[2]) == len(split.held_out.initial_cost)
     assert not costs[0] & costs[1]
     assert not costs[1] & costs[2]

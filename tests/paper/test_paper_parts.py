@@ -1,4 +1,5 @@
-"""Parts of the reproduction: sub-problems, schedules, rows, claims, results, configuration and real problems."""
+"""Parts of the reproduction: sub-problems, schedules, rows, claims, results, configuration and real
+problems."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from jaxba.solver.record import Record, TracePoint
 
 
 def hand_made() -> BundleProblem:
-    """Cameras that observe each point: 0: cameras 0, 1, 2; 1: 0, 1; 2: 2, 3; 3: camera 3 twice; 4: 1, 3."""
+    """Cameras that observe each point: 0: cameras 0, 1, 2; 1: 0, 1; 2: 2, 3; 3: camera 3 twice; 4:
+    1, 3."""
     seen = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 2), (3, 2), (3, 3), (3, 3), (1, 4), (3, 4)]
     cameras = np.zeros((4, 9))
     cameras[:, 0], cameras[:, 6] = np.arange(4), 100.0
@@ -36,7 +38,8 @@ def test_a_sub_problem_has_the_given_cameras_and_the_points_that_two_of_them_obs
     whole = hand_made()
     part = sub_problem(whole, [0, 1, 3])
     assert part.cameras[:, 0].tolist() == [0.0, 1.0, 3.0]
-    assert part.points[:, 0].tolist() == [0.0, 1.0, 4.0]  # 2 keeps one camera, 3 has two observations of a single one
+    # 2 keeps one camera, 3 has two observations of a single one
+    assert part.points[:, 0].tolist() == [0.0, 1.0, 4.0]
     pairs = list(zip(part.camera_index.tolist(), part.point_index.tolist(), strict=True))
     assert pairs == [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]
     assert part.observations[:, 0].tolist() == [0.0, 2.0, 6.0, 8.0, 18.0, 20.0]
@@ -70,7 +73,8 @@ def test_an_impossible_sub_problem_is_an_error_of_one_line(cameras, points, word
 
 
 def test_neighbouring_cameras_start_with_the_one_that_observes_most_points():
-    # camera 1 and 3 see three points each, the first of them is 1; it shares two points with 0, one with 2 and with 3
+    # camera 1 and 3 see three points each, the first of them is 1; it shares two points with 0, one
+    # with 2 and with 3
     assert neighbouring_cameras(hand_made(), 1).tolist() == [1]
     assert neighbouring_cameras(hand_made(), 2).tolist() == [0, 1]
     assert neighbouring_cameras(hand_made(), 4).tolist() == [0, 1, 2, 3]
@@ -89,7 +93,12 @@ def test_a_sub_problem_of_a_scene_is_made_when_it_is_read():
 
 
 def test_a_schedule_is_the_arithmetic_mean_at_each_iteration():
-    assert average_schedule([[1.0, 2.0, 3.0, 4.0, 9.0], [3.0, 4.0, 5.0, 8.0]]) == (2.0, 3.0, 4.0, 6.0)
+    assert average_schedule([[1.0, 2.0, 3.0, 4.0, 9.0], [3.0, 4.0, 5.0, 8.0]]) == (
+        2.0,
+        3.0,
+        4.0,
+        6.0,
+    )
 
 
 def test_a_solve_that_ended_early_does_not_enter_the_later_means():
@@ -107,14 +116,20 @@ def test_a_schedule_is_as_long_as_the_longest_solve_at_most():
 
 
 def solved(
-    iterations: float, converged: bool = True, near: float = 2.0, end: float = 0.0, seconds: float = 1.0
+    iterations: float,
+    converged: bool = True,
+    near: float = 2.0,
+    end: float = 0.0,
+    seconds: float = 1.0,
 ) -> Outcome:
     return Outcome(float(iterations), converged, near, end, seconds)
 
 
 def test_a_row_has_the_mean_over_problems_and_the_range_over_seeds():
     found = results.row_of(
-        "x", {0: [solved(4), solved(6)], 1: [solved(8, end=0.02), solved(100, False, near=100.0)]}, trained=True
+        "x",
+        {0: [solved(4), solved(6)], 1: [solved(8, end=0.02), solved(100, False, near=100.0)]},
+        trained=True,
     )
     assert (found.iterations, found.low, found.high) == (29.5, 5.0, 54.0)
     assert (found.success, found.good_ends, found.near) == (0.75, 0.75, 26.5)
@@ -130,7 +145,15 @@ def test_a_rule_has_no_seeds_and_without_solves_the_mean_is_nan():
 
 def test_a_failure_counts_as_the_limit_in_a_play():
     play = Play(
-        "test", "x", 0, (3, 100, 120), (True, False, True), (0.0, math.inf, 4.0), (0.0, 0.5, 0.0), ((), (), ()), 0.0
+        "test",
+        "x",
+        0,
+        (3, 100, 120),
+        (True, False, True),
+        (0.0, math.inf, 4.0),
+        (0.0, 0.5, 0.0),
+        ((), (), ()),
+        0.0,
     )
     found = results.of_play(play)
     assert [o.iterations for o in found] == [3.0, 100.0, 100.0]
@@ -157,8 +180,19 @@ def record(
         "repeat": repeat,
         "family": "f",
     }
-    ends = {"initial_cost": costs[0], "final_cost": costs[-1], "iterations": len(costs) - 1, "accepted": len(costs) - 1}
-    times = {"setup_s": setup_s, "compile_s": 9.0, "total_s": 99.0, "cg_iterations": 0, "termination": termination}
+    ends = {
+        "initial_cost": costs[0],
+        "final_cost": costs[-1],
+        "iterations": len(costs) - 1,
+        "accepted": len(costs) - 1,
+    }
+    times = {
+        "setup_s": setup_s,
+        "compile_s": 9.0,
+        "total_s": 99.0,
+        "cg_iterations": 0,
+        "termination": termination,
+    }
     return Record(problem=problem, trace=trace, **sizes, **where, **ends, **times)
 
 
@@ -177,11 +211,25 @@ def test_outcomes_of_records_agree_with_numbers_by_hand():
 
 
 def of(
-    iterations: float, low: float | None = None, high: float | None = None, success: float = 1.0, seeds: int = 2
+    iterations: float,
+    low: float | None = None,
+    high: float | None = None,
+    success: float = 1.0,
+    seeds: int = 2,
 ) -> Row:
     ends = (iterations if low is None else low, iterations if high is None else high)
     low, high = map(float, ends)
-    return Row("x", float(iterations), low, high, near=1.0, success=success, good_ends=1.0, seeds=seeds, solves=3)
+    return Row(
+        "x",
+        float(iterations),
+        low,
+        high,
+        near=1.0,
+        success=success,
+        good_ends=1.0,
+        seeds=seeds,
+        solves=3,
+    )
 
 
 @pytest.mark.parametrize(
@@ -207,7 +255,13 @@ def test_rule_for_ratios(ours, base, status):
 
 @pytest.mark.parametrize(
     ("ours_s", "success", "status"),
-    [(2.5, 1.0, "reproduced"), (2.6, 1.0, "partly"), (9.1, 1.0, "not"), (2.0, 0.9, "not"), (math.nan, 1.0, "not run")],
+    [
+        (2.5, 1.0, "reproduced"),
+        (2.6, 1.0, "partly"),
+        (9.1, 1.0, "not"),
+        (2.0, 0.9, "not"),
+        (math.nan, 1.0, "not run"),
+    ],
 )
 def test_rule_for_times_is_that_for_ratios(ours_s, success, status):
     ours = of(4, success=success)._replace(seconds=ours_s)
@@ -242,7 +296,12 @@ def test_rule_for_fractions(ours, status):
 
 @pytest.mark.parametrize(
     ("excess", "status"),
-    [([-1.0, 0.002], "reproduced"), ([0.002, 0.004], "partly"), ([0.002, 0.004, 0.01], "not"), ([], "not run")],
+    [
+        ([-1.0, 0.002], "reproduced"),
+        ([0.002, 0.004], "partly"),
+        ([0.002, 0.004, 0.01], "not"),
+        ([], "not run"),
+    ],
 )
 def test_rule_for_errors(excess, status):
     assert claims.error_claim("claim", 0.003, excess).status == status
@@ -265,7 +324,10 @@ def test_a_claim_about_speed_asks_for_the_same_success(ours, faster, status):
         record(name, [100.0, end], step_s=seconds, setup_s=0.0), solver=solver
     )
     records = [solve(name, "classic", 2.0, 1.0) for name in "ab"]
-    records += [solve(name, agents.BEST.name, ours.get(name, 1.0), 1.0 if name in ours else 50.0) for name in "ab"]
+    records += [
+        solve(name, agents.BEST.name, ours.get(name, 1.0), 1.0 if name in ours else 50.0)
+        for name in "ab"
+    ]
     assert figures.speed_claim(records, 0.001, "claim", faster).status == status
 
 
@@ -274,11 +336,15 @@ def test_more_seconds_are_a_claim_of_their_own():
     found = claims.longer_claim("claim", "+0.5 s", ours, base)
     assert (found.status, found.ours) == ("reproduced", "+250.0 ms (1250 / 1000 ms)")
     assert claims.longer_claim("claim", "+0.5 s", base, ours).status == "not"
-    assert claims.longer_claim("claim", "+0.5 s", ours, of(20)).status == "not run"  # the other was not measured
+    # the other was not measured
+    assert claims.longer_claim("claim", "+0.5 s", ours, of(20)).status == "not run"
 
 
 def test_a_table_has_the_numbers_of_the_paper_and_both_ratios():
-    lines = [common.named("classic", "classic", 20.0), common.Line("ours", method_named("bold"), 4.0)]
+    lines = [
+        common.named("classic", "classic", 20.0),
+        common.Line("ours", method_named("bold"), 4.0),
+    ]
     rows = {"classic": of(20, seeds=0), "ceres": of(8, seeds=0), "bold": of(4, 3, 5)}
     text = common._comparison(lines, rows)
     cells = [cell.strip() for cell in text.splitlines()[-1].strip("|").split("|")]
@@ -289,7 +355,17 @@ def test_a_table_has_the_numbers_of_the_paper_and_both_ratios():
 
 
 def test_results_are_read_as_they_were_written(tmp_path):
-    play = Play("test", "x", 1, (3, 4), (True, False), (1.0, math.inf), (0.0, 1e-3), ((1e-15, 2.0), ()), 0.25)
+    play = Play(
+        "test",
+        "x",
+        1,
+        (3, 4),
+        (True, False),
+        (1.0, math.inf),
+        (0.0, 1e-3),
+        ((1e-15, 2.0), ()),
+        0.25,
+    )
     store = Store(tmp_path)
     store.add_play(play)
     store.add_solve(record("a", [4.0, 2.0]))
@@ -365,10 +441,14 @@ def test_without_the_variable_there_are_no_real_problems(monkeypatch):
     assert real_problems.bal(settings).sources == ()
 
 
-def test_files_and_their_sub_problems_are_found_and_missing_ones_are_reported(monkeypatch, tmp_path):
+def test_files_and_their_sub_problems_are_found_and_missing_ones_are_reported(
+    monkeypatch, tmp_path
+):
     monkeypatch.setenv("JAXBA_DATA", str(tmp_path))
     (tmp_path / "problem-6-40-pre.txt").write_text("")
-    family = config.FamilyConfig("Ladybug", ("$JAXBA_DATA/problem-*.txt", "$JAXBA_DATA/other.txt"), (3, 4))
+    family = config.FamilyConfig(
+        "Ladybug", ("$JAXBA_DATA/problem-*.txt", "$JAXBA_DATA/other.txt"), (3, 4)
+    )
     found = real_problems.find(family)
     assert [source.name for source in found.sources] == [
         "problem-6-40-pre",
@@ -378,7 +458,10 @@ def test_files_and_their_sub_problems_are_found_and_missing_ones_are_reported(mo
     assert found.missing == ("$JAXBA_DATA/other.txt",)
     assert found.reason == ""
     names = lambda whole: [
-        s.name for s in real_problems.bal(config.RealConfig((dataclasses.replace(family, whole=whole),))).sources
+        s.name
+        for s in real_problems.bal(
+            config.RealConfig((dataclasses.replace(family, whole=whole),))
+        ).sources
     ]
     assert names(True) == [source.name for source in found.sources]
     assert names(False) == names(True)[1:]
@@ -397,7 +480,9 @@ def test_an_agent_is_trained_on_other_problems_than_those_it_is_judged_on(monkey
     assert real_problems.training_files(real, part) == ("drive-2", (path("drive-1"),))
     settings = dataclasses.replace(config.load("fast"), real=real)
     judged_on_a, judged_on_b = (
-        agents.trained_elsewhere(settings, real_problems.find(family).sources[0], agents.BEST, "stba")
+        agents.trained_elsewhere(
+            settings, real_problems.find(family).sources[0], agents.BEST, "stba"
+        )
         for family in real.bal
     )
     assert judged_on_a
@@ -406,8 +491,11 @@ def test_an_agent_is_trained_on_other_problems_than_those_it_is_judged_on(monkey
     assert judged_on_a.name != judged_on_b.name
     found = agents.train_config(settings, judged_on_a)
     assert (found.bank.problems, found.bank.kind.family) == ((path("b-50"),), "windows")
-    assert (found.method, found.bank.intrinsics) == ("stba", "free")  # with the steps that it drives, on their unknowns
+    # with the steps that it drives, on their unknowns
+    assert (found.method, found.bank.intrinsics) == ("stba", "free")
     kitti = agents.trained_elsewhere(settings, part, agents.PRINTED)
     assert kitti
     assert agents.train_config(settings, kitti).bank.intrinsics == "fixed"
-    assert agents.trained_elsewhere(settings, Source("x", "scene", "scene:tiny"), agents.BEST) is None
+    assert (
+        agents.trained_elsewhere(settings, Source("x", "scene", "scene:tiny"), agents.BEST) is None
+    )

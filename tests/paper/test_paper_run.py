@@ -1,4 +1,5 @@
-"""`jaxba-paper` in this process: one table on tiny scenes, continuing, a missing record, and errors of one line."""
+"""`jaxba-paper` in this process: one table on tiny scenes, continuing, a missing record, and errors
+of one line."""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ def finished(settings, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("JAXBA_DATA", raising=False)
         patch.setattr(rollout, "LANES", groups.GROUP)
-        patch.setattr(scene_bank, "PORTFOLIO", ("ceres",))  # every rule needs its own compiled program
+        # every rule needs its own compiled program
+        patch.setattr(scene_bank, "PORTFOLIO", ("ceres",))
         assert run(command(settings, folder)) == 0
     return folder
 
@@ -78,8 +80,16 @@ def runs(capsys) -> int:
 @pytest.mark.slow
 def test_one_table_in_an_empty_folder(finished):
     plays = [json.loads(line) for line in (finished / PLAYS).read_text().splitlines()]
-    trained = ["agent-printed", "agent", "agent-constant", "agent-guarded", "agent-guarded-constant"]
-    assert [(p["method"], p["seed"]) for p in plays] == [(name, 0) for name in ("classic", "ceres", *trained)]
+    trained = [
+        "agent-printed",
+        "agent",
+        "agent-constant",
+        "agent-guarded",
+        "agent-guarded-constant",
+    ]
+    assert [(p["method"], p["seed"]) for p in plays] == [
+        (name, 0) for name in ("classic", "ceres", *trained)
+    ]
     assert len({len(p["iterations"]) for p in plays}) == 1
     text = (finished.parent / "docs" / "paper.md").read_text()
     assert "`jaxba-paper --config tiny.yaml`" in text
@@ -88,8 +98,12 @@ def test_one_table_in_an_empty_folder(finished):
     assert "**BAL**: not run: JAXBA_DATA is not set." in text
     assert re.search(r"\| Ladybug: DeepLM \+ ours over DeepLM, seconds .* \*\*not run\*\* \|", text)
     row = next(line for line in text.splitlines() if line.startswith("| classic | 20 |"))
-    mean = sum(i if c else 100 for i, c in zip(plays[0]["iterations"], plays[0]["converged"], strict=True))
-    assert row.split("|")[3].strip() == f"{mean / len(plays[0]['iterations']):.1f}".removesuffix(".0")
+    mean = sum(
+        i if c else 100 for i, c in zip(plays[0]["iterations"], plays[0]["converged"], strict=True)
+    )
+    assert row.split("|")[3].strip() == f"{mean / len(plays[0]['iterations']):.1f}".removesuffix(
+        ".0"
+    )
     for entry in TABLES_AND_FIGURES.values():
         assert entry.title
     assert text.count("\n## ") >= len(TABLES_AND_FIGURES)
@@ -140,10 +154,14 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
     assert "--only tables: unknown; known: kitti, bal" in error_of(capsys, "--only", "tables")
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text("seeds: 3")
-    assert "unknown key seeds" in error_of(capsys, "--config", str(wrong), "--out", str(tmp_path / "run"))
+    assert "unknown key seeds" in error_of(
+        capsys, "--config", str(wrong), "--out", str(tmp_path / "run")
+    )
     assert not (tmp_path / "run").exists()
     missing = str(tmp_path / "none" / "paper.md")
-    assert "does not exist" in error_of(capsys, "--config", "fast", "--out", str(tmp_path / "run"), "--report", missing)
+    assert "does not exist" in error_of(
+        capsys, "--config", "fast", "--out", str(tmp_path / "run"), "--report", missing
+    )
 
 
 def test_list_prints_all_tables_and_figures(capsys):

@@ -69,11 +69,15 @@ def test_the_gradient_of_a_weight_follows_the_chain_rule():
 
     def moved(by: float) -> ZeroNet:
         *hidden, last = net.layers
-        return ZeroNet((*hidden, Layer(last.kernel, last.bias + jnp.asarray(by, jnp.float32))), AGENT)
+        return ZeroNet(
+            (*hidden, Layer(last.kernel, last.bias + jnp.asarray(by, jnp.float32))), AGENT
+        )
 
     action = lambda bias: moved(bias).act(episode.memory)
     h = 0.02
-    expected = (next_cost(episode, float(action(h))) - next_cost(episode, float(action(-h)))) / (2 * h)
+    expected = (next_cost(episode, float(action(h))) - next_cost(episode, float(action(-h)))) / (
+        2 * h
+    )
     slope = float(_slope(episode, action(0.0))[1])
     assert slope * float(jax.grad(action)(0.0)) == pytest.approx(expected, rel=2e-2)
 
@@ -88,7 +92,9 @@ def test_the_input_is_errors_actions_and_rewards_of_the_last_steps():
     rms = lambda cost: np.sqrt(2 * float(cost) / float(first.info.observations))
     errors = [min(rms(cost), 1000.0) for cost in (step.cost, one.state.cost, first.cost)]
     assert seen[0] == pytest.approx(errors, rel=1e-6)
-    decades = [np.log10(float(damping_of(AGENT, first.guard, jnp.asarray(a)))) for a in (-0.5, 0.25)]
+    decades = [
+        np.log10(float(damping_of(AGENT, first.guard, jnp.asarray(a)))) for a in (-0.5, 0.25)
+    ]
     assert seen[1] == pytest.approx([*((d + 4) / 6 for d in decades), 0.0], abs=1e-6)
     assert seen[2].tolist() == [-1.0, -1.0, 0.0]
 

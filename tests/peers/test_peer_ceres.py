@@ -1,8 +1,8 @@
 """Ceres as another solver: its costs are those of BAL, and its steps are jaxba's.
 
-jaxba is compared with `rotation="manifold"`: Ceres rotates a quaternion by twice its tangent vector, from the left. The
-factor of two is a scaling of variables, to which diagonal damping is invariant.
-"""
+jaxba is compared with `rotation="manifold"`: Ceres rotates a quaternion by twice its tangent
+vector, from the left. The factor of two is a scaling of variables, to which diagonal damping is
+invariant."""
 
 from __future__ import annotations
 
@@ -43,11 +43,20 @@ MANIFOLD = StepOptions(coordinates=Coordinates(rotation="manifold"))
 NEVER = Tolerances(ftol=0.0, xtol=0.0, gtol=0.0)
 
 LADYBUG = "bal/problem-49-7776-pre"
-IN_FRONT = ("bal/problem-21-11315-pre", "bal-converted/sba-54-5207-pre", "bal-converted/kittistereo00s-77-15638-pre")
+IN_FRONT = (
+    "bal/problem-21-11315-pre",
+    "bal-converted/sba-54-5207-pre",
+    "bal-converted/kittistereo00s-77-15638-pre",
+)
 """Real problems without a point behind a camera."""
 SMALL = tuple(
     f"bal-converted/{name}"
-    for name in ("balbianello-5-544-pre", "colmap-yding-7-699-post", "sba-7-465-pre", "sba-9-559-pre")
+    for name in (
+        "balbianello-5-544-pre",
+        "colmap-yding-7-699-post",
+        "sba-7-465-pre",
+        "sba-9-559-pre",
+    )
 )
 """Small real problems without a point behind a camera."""
 
@@ -57,9 +66,12 @@ def real(name: str) -> BundleProblem:
 
 
 def scattered(seed: int, far: float = 3) -> BundleProblem:
-    """`tiny` with Gaussian noise of standard deviation `far` on its points, which are at a depth of some nine."""
+    """`tiny` with Gaussian noise of standard deviation `far` on its points, which are at a depth of
+    some nine."""
     problem = support.tiny()
-    return problem.replace(points=problem.points + far * np.random.default_rng(seed).normal(size=problem.points.shape))
+    return problem.replace(
+        points=problem.points + far * np.random.default_rng(seed).normal(size=problem.points.shape)
+    )
 
 
 # The problem
@@ -81,10 +93,14 @@ def test_residuals_are_those_of_bal_also_behind_the_camera(make):
     colmap = ColmapProblem(problem)
     assert colmap.in_python.sum() == np.sum(geometry.depths(problem) <= 0)
     ours = -geometry.residuals(problem) * (1, -1)
-    found = np.array([cost.evaluate(*blocks(colmap, k))[0].ravel() for k, cost in enumerate(colmap._costs)])
+    found = np.array(
+        [cost.evaluate(*blocks(colmap, k))[0].ravel() for k, cost in enumerate(colmap._costs)]
+    )
     np.testing.assert_allclose(found, ours, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(
-        0.5 * np.sum(np.square(colmap.ceres.evaluate_residuals())), geometry.cost(problem), rtol=1e-12
+        0.5 * np.sum(np.square(colmap.ceres.evaluate_residuals())),
+        geometry.cost(problem),
+        rtol=1e-12,
     )
 
 
@@ -165,7 +181,9 @@ print("done")
 
 def test_memory_that_ceres_points_to_lives_as_long_as_the_problem_and_is_freed_once():
     """Runs in its own process, since the process must exit cleanly."""
-    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=300
+    )
     assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
 
 
@@ -173,8 +191,8 @@ def test_memory_that_ceres_points_to_lives_as_long_as_the_problem_and_is_freed_o
 
 
 def under_its_lambdas(found, problem):
-    """The solve of jaxba in Ceres' coordinates and under the lambdas of a solve by Ceres, as long as that took steps:
-    it stops before the last step where that would change little."""
+    """The solve of jaxba in Ceres' coordinates and under the lambdas of a solve by Ceres, as long
+    as that took steps: it stops before the last step where that would change little."""
     taken = found.iterations - (found.termination == Termination.COST)
     its_own = Schedule(values=tuple(found.history.damping[:taken].tolist()), min_gain=1e-3)
     return taken, solve(problem, its_own, MANIFOLD, max_iterations=taken, tolerances=NEVER)
@@ -187,8 +205,12 @@ def test_costs_are_those_of_jaxba_under_the_same_lambdas(mode, make):
     taken, ours = under_its_lambdas(found, make())
     np.testing.assert_array_equal(found.history.accepted[:taken], ours.history.accepted)
     np.testing.assert_allclose(found.history.cost[:taken], ours.history.cost, rtol=1e-9)
-    np.testing.assert_allclose(found.history.candidate_cost[:taken], ours.history.candidate_cost, rtol=1e-9)
-    good = ours.history.accepted & (ours.history.cost < 0.999 * np.r_[ours.initial_cost, ours.history.cost[:-1]])
+    np.testing.assert_allclose(
+        found.history.candidate_cost[:taken], ours.history.candidate_cost, rtol=1e-9
+    )
+    good = ours.history.accepted & (
+        ours.history.cost < 0.999 * np.r_[ours.initial_cost, ours.history.cost[:-1]]
+    )
     gains = found.history.gain_ratio[:taken]
     np.testing.assert_allclose(gains[good], ours.history.gain_ratio[good], rtol=1e-7)
 
@@ -238,7 +260,9 @@ def test_inner_iterations_go_further_with_the_same_first_step(mode):
 
 def test_what_is_returned_is_consistent():
     seen = []
-    found = solve_by_ceres(support.odd(), "dense", callback=lambda record: seen.append(record) and None)
+    found = solve_by_ceres(
+        support.odd(), "dense", callback=lambda record: seen.append(record) and None
+    )
     assert found.converged
     np.testing.assert_allclose(found.initial_cost, geometry.cost(support.odd()), rtol=1e-12)
     assert found.final_cost == geometry.cost(found.problem) == found.history.cost[-1]
@@ -306,7 +330,8 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
 @needs_data
 @pytest.mark.slow
 def test_with_points_behind_cameras_ceres_ends_on_ladybug_where_bal_s_cost_says():
-    """13344.318 is the final cost of C++ Ceres 2.1 with BAL's cost function, in other coordinates (test_golden.py)."""
+    """13344.318 is the final cost of C++ Ceres 2.1 with BAL's cost function, in other coordinates
+    (test_golden.py)."""
     found = solve_by_ceres(real(LADYBUG), "dense")
     np.testing.assert_allclose(found.initial_cost, 850912.460681, rtol=1e-11)
     np.testing.assert_allclose(found.final_cost, 13344.3183, rtol=1e-6)
@@ -317,10 +342,10 @@ def test_with_points_behind_cameras_ceres_ends_on_ladybug_where_bal_s_cost_says(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", IN_FRONT[:1])
 def test_real_costs_of_ceres_alone_are_those_of_jaxba_under_its_lambdas(name):
-    """Only twelve iterations are compared. In the next one, four observations of kittistereo00s are behind a camera:
-    their points passed through infinity and depend on the lower limit of the diagonal. Ceres applies the limit after
-    its column scaling, jaxba without one, which makes a relative difference of 1.2e-6 in the cost.
-    """
+    """Only twelve iterations are compared. In the next one, four observations of kittistereo00s are
+    behind a camera: their points passed through infinity and depend on the lower limit of the
+    diagonal. Ceres applies the limit after its column scaling, jaxba without one, which makes a
+    relative difference of 1.2e-6 in the cost."""
     problem = real(name)
     found = solve_by_ceres(problem, "dense", max_iterations=12)
     taken, ours = under_its_lambdas(found, problem)

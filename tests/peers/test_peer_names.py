@@ -1,4 +1,5 @@
-"""Solver names of other libraries, and the error where the library is not installed; needs no library."""
+"""Solver names of other libraries, and the error where the library is not installed; needs no
+library."""
 
 from __future__ import annotations
 
@@ -57,7 +58,10 @@ def test_without_its_library_a_peer_is_refused_before_anything_runs(monkeypatch,
     monkeypatch.setattr(peers, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
         bench_run.plan(sources(["scene:tiny"]), ["classic", "pyceres:dense"], 1)
-    assert run(["scene:tiny", "--solvers", "classic,pyceres:dense", "--out", str(tmp_path / "run")]) == 2
+    assert (
+        run(["scene:tiny", "--solvers", "classic,pyceres:dense", "--out", str(tmp_path / "run")])
+        == 2
+    )
     error = capsys.readouterr().err
     assert error.startswith("error: 'pyceres:dense' needs pyceres")
     assert error.count("\n") == 1

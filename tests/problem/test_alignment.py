@@ -1,4 +1,5 @@
-"""A scene is aligned with measured positions as far as these determine it, and positions that cannot be are refused."""
+"""A scene is aligned with measured positions as far as these determine it, and positions that
+cannot be are refused."""
 
 from __future__ import annotations
 
@@ -29,8 +30,11 @@ def at_places(centers: np.ndarray) -> BundleProblem:
     )
 
 
-def flight(seed: int, noise: float, across: float = 0.0, own: float = 0.01) -> tuple[BundleProblem, np.ndarray]:
-    """A scene on a line along x with errors of its own, and positions of it in the same frame with noise."""
+def flight(
+    seed: int, noise: float, across: float = 0.0, own: float = 0.01
+) -> tuple[BundleProblem, np.ndarray]:
+    """A scene on a line along x with errors of its own, and positions of it in the same frame with
+    noise."""
     rng = np.random.default_rng(seed)
     true = np.c_[15.0 * np.arange(COUNT), across * rng.uniform(-1, 1, COUNT), np.full(COUNT, 80.0)]
     scene = true + own * rng.normal(size=true.shape)
@@ -71,7 +75,9 @@ def test_a_flight_that_leaves_its_line_by_less_than_the_errors_of_the_scene_keep
 
 def test_a_flight_with_a_second_strip_determines_the_roll():
     problem, positions = flight(0, 0.02, across=5.0)
-    found = with_position_priors(problem, Rotation.from_rotvec([1.0, 0, 0]).apply(positions), stddev=0.02)
+    found = with_position_priors(
+        problem, Rotation.from_rotvec([1.0, 0, 0]).apply(positions), stddev=0.02
+    )
     np.testing.assert_allclose(turn_of(problem, found), [1.0, 0, 0], atol=0.01)
 
 
@@ -85,7 +91,9 @@ def test_a_line_is_mapped_to_a_line_by_the_smallest_rotation():
         found = along_line(source, target, np.ones(6))
         np.testing.assert_allclose(found.points(source), target, atol=1e-9)
         rotation = Rotation.from_matrix(found.rotation)
-        np.testing.assert_allclose([rotation.magnitude(), np.linalg.det(found.rotation)], [angle, 1], atol=1e-7)
+        np.testing.assert_allclose(
+            [rotation.magnitude(), np.linalg.det(found.rotation)], [angle, 1], atol=1e-7
+        )
 
 
 @pytest.mark.parametrize(("images", "scale"), [([3], 1.0), ([0, 1, 2, 3], 1.0), ([0, 5], 30.0)])
@@ -93,10 +101,14 @@ def test_few_positions_or_ones_within_their_noise_say_what_they_can(images, scal
     problem, positions = block()
     close = images == [0, 1, 2, 3]
     with pytest.warns(ProblemWarning, match=ON_A_LINE if scale > 1 else AT_ONE_PLACE):
-        found = with_position_priors(problem, positions[images], stddev=1e3 if close else 1.0, images=images)
+        found = with_position_priors(
+            problem, positions[images], stddev=1e3 if close else 1.0, images=images
+        )
     before, after = (geometry.camera_centers(p.cameras)[images] for p in (problem, found))
     np.testing.assert_allclose(after.mean(axis=0), positions[images].mean(axis=0), atol=1e-8)
-    np.testing.assert_allclose(after.std(axis=0).max() / max(before.std(axis=0).max(), 1e-9) > 5, scale > 1)
+    np.testing.assert_allclose(
+        after.std(axis=0).max() / max(before.std(axis=0).max(), 1e-9) > 5, scale > 1
+    )
     if scale == 1.0:
         np.testing.assert_allclose(found.cameras[:, :3], problem.cameras[:, :3], atol=1e-12)
 
@@ -111,12 +123,17 @@ def degrees(metres: np.ndarray, latitude: float) -> np.ndarray:
     ("change", "message"),
     [
         (lambda p: degrees(p, 47.0), "latitude and longitude in degrees: give metres"),
-        (lambda p: degrees(p, -33.0)[:, [1, 0, 2]], "latitude and longitude in degrees: give metres"),
+        (
+            lambda p: degrees(p, -33.0)[:, [1, 0, 2]],
+            "latitude and longitude in degrees: give metres",
+        ),
         (lambda p: p[:, [1, 0, 2]], "mirrored: are two axes swapped, or is one reversed"),
         (lambda p: p * [1, 1, -1], "mirrored: are two axes swapped, or is one reversed"),
     ],
 )
-def test_degrees_and_mirrored_axes_are_refused_whatever_the_standard_deviations(change, message, stddev):
+def test_degrees_and_mirrored_axes_are_refused_whatever_the_standard_deviations(
+    change, message, stddev
+):
     problem, positions = block()
     wrong = change(positions)
     with pytest.raises(ProblemError, match=message):
@@ -128,7 +145,10 @@ def test_degrees_and_mirrored_axes_are_refused_whatever_the_standard_deviations(
 def test_positions_that_do_not_fit_are_noted_and_those_that_do_are_not():
     problem, positions = block()
     rng = np.random.default_rng(3)
-    with pytest.warns(ProblemWarning, match=r"a quarter of the images .* times what the standard deviations explain"):
+    with pytest.warns(
+        ProblemWarning,
+        match=r"a quarter of the images .* times what the standard deviations explain",
+    ):
         with_position_priors(problem, positions * [1, 1, 3], stddev=0.5)
     some = positions + 0.5 * rng.normal(size=positions.shape)
     with_position_priors(problem, some, stddev=0.5)
@@ -138,7 +158,9 @@ def test_wrong_positions_are_named_and_do_not_move_the_scene():
     problem, positions = block()
     some = positions + 0.5 * np.random.default_rng(3).normal(size=positions.shape)
     some[[4, 7]] += [500.0, -300.0, 0.0]
-    with pytest.warns(ProblemWarning, match=r"the others: camera [47] is 58\d .*, camera [47] is 58\d .*\)$"):
+    with pytest.warns(
+        ProblemWarning, match=r"the others: camera [47] is 58\d .*, camera [47] is 58\d .*\)$"
+    ):
         found = with_position_priors(problem, some, stddev=0.5)
     away = np.linalg.norm(geometry.camera_centers(found.cameras) - positions, axis=1)
     assert away.max() < 1.5
@@ -153,7 +175,9 @@ def test_four_positions_with_an_axis_mirrored_are_refused():
 def test_exact_images_count_more_than_rough_ones():
     problem, positions = block()
     rough = np.arange(COUNT) % 2 == 1
-    noisy = positions + np.where(rough[:, None], 5.0, 0.01) * np.random.default_rng(0).normal(size=positions.shape)
+    noisy = positions + np.where(rough[:, None], 5.0, 0.01) * np.random.default_rng(0).normal(
+        size=positions.shape
+    )
     found = with_position_priors(problem, noisy, stddev=np.where(rough, 5.0, 0.01))
     away = np.linalg.norm(geometry.camera_centers(found.cameras) - positions, axis=1)
     assert away.max() < 0.05

@@ -52,7 +52,13 @@ def test_problems_are_equal_where_all_their_arrays_are():
     assert problem == copy.deepcopy(problem) == pickle.loads(pickle.dumps(problem))
     assert problem == problem.replace(points=jnp.asarray(problem.points))
     assert held == hold(problem, poses=[0], numbers=["k1"])
-    for other in (held, problem.replace(points=moved), problem.replace(points=problem.points[1:]), "problem", None):
+    for other in (
+        held,
+        problem.replace(points=moved),
+        problem.replace(points=problem.points[1:]),
+        "problem",
+        None,
+    ):
         assert problem != other
     assert held != hold(problem, poses=[1], numbers=["k1"])
     with pytest.raises(TypeError, match="unhashable type: 'BundleProblem'"):
@@ -71,9 +77,12 @@ def shown() -> dict[str, object]:
     assert isinstance(problem.constants, Constants)
     history = StepInfo(*[np.arange(9.0)] * len(StepInfo._fields))
     policy = make_policy("learned")
-    return {"problem": problem, "inputs": inputs_of(problem), "history": history, "policy": policy} | {
-        field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)[6:8]
-    }
+    return {
+        "problem": problem,
+        "inputs": inputs_of(problem),
+        "history": history,
+        "policy": policy,
+    } | {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)[6:8]}
 
 
 @pytest.mark.parametrize("name", shown())

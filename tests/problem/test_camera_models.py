@@ -1,4 +1,5 @@
-"""Camera models: derivatives are those of differences, and a user's own is solved like any other."""
+"""Camera models: derivatives are those of differences, and a user's own is solved like any
+other."""
 
 from __future__ import annotations
 
@@ -10,12 +11,29 @@ import pytest
 import support
 from scipy.spatial.transform import Rotation
 
-from jaxba import CAMERA_MODELS, BundleProblem, Lenses, Loss, SolveOptions, StepOptions, register_camera_model, solve
+from jaxba import (
+    CAMERA_MODELS,
+    BundleProblem,
+    Lenses,
+    Loss,
+    SolveOptions,
+    StepOptions,
+    register_camera_model,
+    solve,
+)
 from jaxba.linear.schur import jacobian_product
 from jaxba.model.linearize import linearize
 from jaxba.problem import geometry
 
-START = {"omega": 0.8, "alpha": 0.6, "beta": 1.1, "width": 640.0, "height": 320.0, "cx": 320.0, "cy": 240.0}
+START = {
+    "omega": 0.8,
+    "alpha": 0.6,
+    "beta": 1.1,
+    "width": 640.0,
+    "height": 320.0,
+    "cx": 320.0,
+    "cy": 240.0,
+}
 MIXED = ("OPENCV", "SIMPLE_RADIAL_FISHEYE", "BAL")
 
 
@@ -41,7 +59,9 @@ def scene(*names: str, noise: float = 0.3, shared: bool = True) -> BundleProblem
     if not shared:
         index, free = np.arange(plain.num_cameras), free[index]
     model = np.arange(len(free)) % len(names)
-    problem = BundleProblem.create(cameras, *support.arrays(plain)[1:], lenses=Lenses(index, free, model, models))
+    problem = BundleProblem.create(
+        cameras, *support.arrays(plain)[1:], lenses=Lenses(index, free, model, models)
+    )
     pixels = geometry.project(problem)
     return problem.replace(observations=pixels + noise * rng.normal(size=pixels.shape))
 
@@ -51,7 +71,13 @@ COMMON = ("SIMPLE_RADIAL", "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "T
 
 @pytest.mark.parametrize(
     "names",
-    [*(pytest.param((name,), marks=() if name in COMMON else pytest.mark.slow) for name in CAMERA_MODELS), MIXED],
+    [
+        *(
+            pytest.param((name,), marks=() if name in COMMON else pytest.mark.slow)
+            for name in CAMERA_MODELS
+        ),
+        MIXED,
+    ],
     ids="+".join,
 )
 def test_residuals_and_derivatives_are_those_of_the_host_and_of_differences(names):
@@ -60,8 +86,12 @@ def test_residuals_and_derivatives_are_those_of_the_host_and_of_differences(name
     linear = linearize(layout, state.cameras, state.points, Loss())
     order = np.asarray(layout.points)
     rng = np.random.default_rng(2)
-    scale = np.where(np.abs(problem.cameras) > 10, 1.0, 1e-2)  # of focal lengths and principal points, and of the rest
-    change = scale * rng.normal(size=problem.cameras.shape), 1e-2 * rng.normal(size=problem.points.shape)
+    # of focal lengths and principal points, and of the rest
+    scale = np.where(np.abs(problem.cameras) > 10, 1.0, 1e-2)
+    change = (
+        scale * rng.normal(size=problem.cameras.shape),
+        1e-2 * rng.normal(size=problem.points.shape),
+    )
     # what a model has no number for is no column of a camera that has it
     sizes = np.array([len(problem.lenses.model_of(lens)) for lens in problem.lenses.index.tolist()])
     change[0][:, 6:][np.arange(problem.cameras.shape[1] - 6) >= sizes[:, None]] = 0
@@ -70,18 +100,26 @@ def test_residuals_and_derivatives_are_those_of_the_host_and_of_differences(name
 
     def residuals(step: float) -> np.ndarray:
         cameras = problem.cameras + step * change[0]
-        turned = Rotation.from_rotvec(step * change[0][:, :3]) * Rotation.from_rotvec(problem.cameras[:, :3])
+        turned = Rotation.from_rotvec(step * change[0][:, :3]) * Rotation.from_rotvec(
+            problem.cameras[:, :3]
+        )
         cameras[:, :3] = turned.as_rotvec()
-        return -geometry.residuals(problem.replace(cameras=cameras, points=problem.points + step * change[1]))
+        return -geometry.residuals(
+            problem.replace(cameras=cameras, points=problem.points + step * change[1])
+        )
 
     mask = np.asarray(layout.slot_mask)
     camera, point = np.asarray(layout.slot_camera)[mask], order[np.asarray(layout.slot_point)[mask]]
     by_slot = np.lexsort((camera, point))
     by_host = np.lexsort((problem.camera_index, problem.point_index))
     in_order = lambda rows: np.stack([np.asarray(row)[mask] for row in rows], axis=1)[by_slot]
-    np.testing.assert_allclose(in_order(linear.residual), residuals(0.0)[by_host], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        in_order(linear.residual), residuals(0.0)[by_host], rtol=1e-9, atol=1e-9
+    )
     difference = (residuals(1e-4) - residuals(-1e-4))[by_host] / 2e-4
-    np.testing.assert_allclose(in_order(found), difference, rtol=0, atol=1e-6 * np.abs(difference).max())
+    np.testing.assert_allclose(
+        in_order(found), difference, rtol=0, atol=1e-6 * np.abs(difference).max()
+    )
 
 
 def test_a_users_own_model_is_solved_and_a_second_one_of_its_name_is_refused():
@@ -97,18 +135,24 @@ def test_a_users_own_model_is_solved_and_a_second_one_of_its_name_is_refused():
             register_camera_model("UNIFIED", "f k", lambda lens, x, y, z: (x, y))
         problem = scene("UNIFIED", noise=0.0)
         moved = problem.replace(
-            points=problem.points + 0.01 * np.random.default_rng(0).normal(size=problem.points.shape)
+            points=problem.points
+            + 0.01 * np.random.default_rng(0).normal(size=problem.points.shape)
         )
         solution = solve(moved, "ceres", SolveOptions(max_iterations=50))
         assert solution.final_cost < 1e-6 * solution.initial_cost
-        np.testing.assert_allclose(solution.final_cost, geometry.cost(solution.problem), rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            solution.final_cost, geometry.cost(solution.problem), rtol=1e-6, atol=1e-12
+        )
     finally:
         del CAMERA_MODELS["UNIFIED"]
 
 
 @pytest.mark.slow
 def test_mixed_models_end_at_one_cost_with_every_linear_solver_and_embedded_iterations():
-    problem, ways = scene(*MIXED), (("guarded", "explicit"), ("ceres", "sparse"), ("ceres", "implicit"))
+    problem, ways = (
+        scene(*MIXED),
+        (("guarded", "explicit"), ("ceres", "sparse"), ("ceres", "implicit")),
+    )
     options = lambda solver: SolveOptions(linear_solver=solver, max_iterations=60)
     costs = [solve(problem, policy, options(solver)).final_cost for policy, solver in ways]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-5)
@@ -126,7 +170,10 @@ def test_lenses_with_impossible_models_are_refused():
     models = (CAMERA_MODELS["PINHOLE"],)
     index, free = problem.lenses.index, problem.lenses.free
     for lenses, message in (
-        (Lenses(index, free, np.array([1]), models), r"the model of lenses\[0\] is 1, outside 0..0"),
+        (
+            Lenses(index, free, np.array([1]), models),
+            r"the model of lenses\[0\] is 1, outside 0..0",
+        ),
         (Lenses(index, free[:, :3], None, models), "what is free, shape"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -1,4 +1,5 @@
-"""An image that is turned round is left out, and takes nothing with it: the others end where they do without it."""
+"""An image that is turned round is left out, and takes nothing with it: the others end where they
+do without it."""
 
 from __future__ import annotations
 
@@ -39,21 +40,29 @@ def turned(problem: BundleProblem, *images: int) -> BundleProblem:
     cameras = np.array(problem.cameras)
     for image in images:
         turn = BACK @ geometry.rotation_matrices(cameras[image : image + 1, :3])
-        cameras[image, :3], cameras[image, 3:6] = geometry.angle_axis(turn)[0], BACK @ cameras[image, 3:6]
+        cameras[image, :3], cameras[image, 3:6] = (
+            geometry.angle_axis(turn)[0],
+            BACK @ cameras[image, 3:6],
+        )
     return problem.replace(cameras=cameras)
 
 
 def unseen(problem: BundleProblem, image: int) -> BundleProblem:
     """The problem without the key-points of an image."""
     seen = np.asarray(problem.camera_index) != image
-    parts = {name: getattr(problem, name)[seen] for name in ("observations", "camera_index", "point_index")}
+    parts = {
+        name: getattr(problem, name)[seen]
+        for name in ("observations", "camera_index", "point_index")
+    }
     return problem.replace(**parts)
 
 
 def unmoved(problem: BundleProblem) -> Solution:
     """A solve without an iteration."""
     nothing = StepInfo(*[np.zeros(0)] * len(StepInfo._fields))
-    return Solution(problem, 0.0, 0.0, 0, 0, Termination.MAX_ITERATIONS, nothing, "explicit", 0.0, 0.0, 0.0)
+    return Solution(
+        problem, 0.0, 0.0, 0, 0, Termination.MAX_ITERATIONS, nothing, "explicit", 0.0, 0.0, 0.0
+    )
 
 
 @pytest.mark.parametrize("find", [jaxba.solve, solve_and_retriangulate])
@@ -92,7 +101,9 @@ def test_a_few_points_behind_an_image_are_no_reason_to_leave_it_out():
     assert not len(facing_away(support.strayed(-1.0)))
 
 
-@pytest.mark.parametrize(("model", "mirrored"), [("PINHOLE", True), ("FISHEYE", False), ("EQUIRECTANGULAR", False)])
+@pytest.mark.parametrize(
+    ("model", "mirrored"), [("PINHOLE", True), ("FISHEYE", False), ("EQUIRECTANGULAR", False)]
+)
 def test_lenses_that_see_what_is_behind_them_never_face_away(model, mirrored):
     problem = turned(support.tiny(), 2)
     models = (CAMERA_MODELS[model],)
@@ -120,7 +131,10 @@ def test_the_command_refuses_under_strict_and_says_else_what_was_left_out(tmp_pa
     path = tmp_path / "turned.txt"
     write_bal(turned(support.tiny(), 2), path)
     assert run([str(path), "--strict"]) == 2
-    assert "left out 36 observations of an image that faces away from them (camera 2)" in capsys.readouterr().err
+    assert (
+        "left out 36 observations of an image that faces away from them (camera 2)"
+        in capsys.readouterr().err
+    )
     assert run([str(path), "--max-iterations", "1"]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
     assert "(camera 2); its pose stays as it is" in notes[0]

@@ -43,7 +43,11 @@ def model_of(folder: Path, cameras: int = 1, frames: int = 3, points: int = 60) 
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, cameras, frames
     options.num_points3D, options.num_points2D_without_point3D = points, 0
     model = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = 0.5, 0.02, 0.3
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
+        0.5,
+        0.02,
+        0.3,
+    )
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, model)
     return written(model, folder)
@@ -59,7 +63,9 @@ def blind_reference(folder: Path) -> Path:
     """The model, whose reference sensor sees nothing."""
     model = pycolmap.Reconstruction(str(folder))
     reference = model.rig(1).ref_sensor_id.id
-    for image in [model.image(i) for i in model.reg_image_ids() if model.image(i).camera_id == reference]:
+    for image in [
+        model.image(i) for i in model.reg_image_ids() if model.image(i).camera_id == reference
+    ]:
         for key in [k for k, one in enumerate(image.points2D) if one.has_point3D()]:
             model.delete_observation(image.image_id, key)
     return written(model, folder)
@@ -81,13 +87,22 @@ def on_an_imu(folder: Path) -> Path:
 
 
 def by_colmap(
-    folder: Path, gauge: str | None = None, frames: Any = (), points: Any = (), priors: Any = (), **options: bool
+    folder: Path,
+    gauge: str | None = None,
+    frames: Any = (),
+    points: Any = (),
+    priors: Any = (),
+    **options: bool,
 ) -> tuple[int, float]:
     """COLMAP's number of unknowns, and its cost at the end."""
     model, config = pycolmap.Reconstruction(str(folder)), pycolmap.BundleAdjustmentConfig()
     settings = pycolmap.BundleAdjustmentOptions(print_summary=False, **options)
     solver = settings.ceres.solver_options
-    solver.function_tolerance, solver.gradient_tolerance, solver.max_num_iterations = 1e-15, 1e-12, 300
+    solver.function_tolerance, solver.gradient_tolerance, solver.max_num_iterations = (
+        1e-15,
+        1e-12,
+        300,
+    )
     for image in model.reg_image_ids():
         config.add_image(image)
     for frame in frames:
@@ -105,7 +120,9 @@ def by_colmap(
             one.corr_data_id = model.image(image).data_id
             known.append(one)
         more = pycolmap.PosePriorBundleAdjustmentOptions()
-        adjuster = pycolmap.create_pose_prior_ceres_bundle_adjuster(settings, more, config, known, model)
+        adjuster = pycolmap.create_pose_prior_ceres_bundle_adjuster(
+            settings, more, config, known, model
+        )
     else:
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(settings, config, model)
     summary = adjuster.solve().ceres_summary
@@ -121,7 +138,8 @@ def gauged(problem: BundleProblem, gauge: str, note: str | None = None) -> Bundl
 
 
 def with_frames_held(problem: BundleProblem, folder: Path, frames: list[int]) -> BundleProblem:
-    """The problem with constant frames, by their images of the reference sensor, or of others that do not move."""
+    """The problem with constant frames, by their images of the reference sensor, or of others that
+    do not move."""
     model = pycolmap.Reconstruction(str(folder))
     moves = np.zeros(problem.num_cameras, bool)
     if problem.rigs is not None and problem.rigs.free is not None:
@@ -151,7 +169,10 @@ def test_two_cameras_leave_the_scale_that_constant_sensors_give(tmp_path, held):
     folder = model_of(tmp_path / "m", 2)
     problem = with_frames_held(hold(read_colmap(folder), extrinsics="all"), folder, [1][:held])
     found = gauged(problem, "two-cameras", NOT_NEEDED if held else None)
-    assert num_unknowns(found) == by_colmap(folder, "two-cameras", frames=[1][:held], **CONSTANT)[0] + 1
+    assert (
+        num_unknowns(found)
+        == by_colmap(folder, "two-cameras", frames=[1][:held], **CONSTANT)[0] + 1
+    )
     ends_as(found, by_colmap(folder, **CONSTANT)[1])
 
 
@@ -162,7 +183,11 @@ def test_three_points_count_points_that_are_held(tmp_path, cameras, held):
     problem = hold(read_colmap(folder), points=range(10, 10 + held), extrinsics="all")
     options, ids = CONSTANT if cameras > 1 else {}, problem.labels.points
     count, _ = by_colmap(folder, "three-points", points=ids[10 : 10 + held], **options)
-    found = gauged(problem, "three-points", NOT_NEEDED if held > 2 else "more than is free" if cameras > 1 else None)
+    found = gauged(
+        problem,
+        "three-points",
+        NOT_NEEDED if held > 2 else "more than is free" if cameras > 1 else None,
+    )
     assert num_unknowns(found) == count
     ends_as(found, by_colmap(folder, points=ids[found.constants.points], **options)[1])
 
@@ -193,16 +218,23 @@ def test_a_rig_without_a_reference_camera_is_rigid(tmp_path, make):
 
 
 @pytest.mark.parametrize("gauge", [pytest.param("free", marks=pytest.mark.slow), "two-cameras"])
-@pytest.mark.parametrize("measured", [1, *(pytest.param(one, marks=pytest.mark.slow) for one in (2, 3, 10))])
+@pytest.mark.parametrize(
+    "measured", [1, *(pytest.param(one, marks=pytest.mark.slow) for one in (2, 3, 10))]
+)
 def test_position_priors_fix_the_gauge_as_far_as_they_can(tmp_path, measured, gauge):
-    """COLMAP leaves fewer than three priors out, and fixes the gauge. A similarity meets them: the cost is equal."""
+    """COLMAP leaves fewer than three priors out, and fixes the gauge. A similarity meets them: the
+    cost is equal."""
     folder = model_of(tmp_path / "m", frames=10)
     problem, rng = read_colmap(folder), np.random.default_rng(0)
     model = pycolmap.Reconstruction(str(folder))
     images = problem.labels.images[:measured].tolist()
     positions = [model.image(i).projection_center() + 0.02 * rng.normal(size=3) for i in images]
-    count, cost = by_colmap(folder, priors=list(zip(images, positions, measured * [0.05], strict=True)))
-    add = lambda: with_position_priors(problem, np.array(positions), stddev=0.05, images=range(measured))
+    count, cost = by_colmap(
+        folder, priors=list(zip(images, positions, measured * [0.05], strict=True))
+    )
+    add = lambda: with_position_priors(
+        problem, np.array(positions), stddev=0.05, images=range(measured)
+    )
     if measured < 3:
         with pytest.warns(ProblemWarning, match="the alignment"):
             known = add()
@@ -216,12 +248,17 @@ def test_position_priors_fix_the_gauge_as_far_as_they_can(tmp_path, measured, ga
 
 @pytest.mark.parametrize(
     ("held", "option"),
-    [({"poses": "frames"}, "refine_rig_from_world"), ({"rotations": "frames"}, "constant_rig_from_world_rotation")],
+    [
+        ({"poses": "frames"}, "refine_rig_from_world"),
+        ({"rotations": "frames"}, "constant_rig_from_world_rotation"),
+    ],
 )
 def test_frames_that_are_held_let_sensors_move(tmp_path, held, option):
     folder = model_of(tmp_path / "m", 2)
     problem = hold(read_colmap(folder), **held)
-    (tmp_path / "c.yaml").write_text("".join(f"constant_{part}: {which}\n" for part, which in held.items()))
+    (tmp_path / "c.yaml").write_text(
+        "".join(f"constant_{part}: {which}\n" for part, which in held.items())
+    )
     named = constrained(read_colmap(folder), (), None, str(tmp_path / "c.yaml"))
     np.testing.assert_array_equal(named.constants.poses, problem.constants.poses)
     count, cost = by_colmap(folder, **{option: "poses" not in held})

@@ -1,4 +1,5 @@
-"""Constants, gauge and priors: the step is that of the dense problem, and what is constant stays bit for bit."""
+"""Constants, gauge and priors: the step is that of the dense problem, and what is constant stays
+bit for bit."""
 
 from __future__ import annotations
 
@@ -38,8 +39,11 @@ NORMAL = StepOptions(method=GlobalConjugateGradients(replace(EXACT, max_iteratio
 
 
 def held() -> BundleProblem:
-    """Two constant poses, a constant rotation, a constant number of every lens, a constant lens and two points."""
-    problem = hold(support.tiny(), poses=[0, 3], rotations=[1], points=[2, 5], lenses=[2], numbers=["k2"])
+    """Two constant poses, a constant rotation, a constant number of every lens, a constant lens and
+    two points."""
+    problem = hold(
+        support.tiny(), poses=[0, 3], rotations=[1], points=[2, 5], lenses=[2], numbers=["k2"]
+    )
     return problem
 
 
@@ -52,18 +56,29 @@ def constant_numbers(problem: BundleProblem) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "solver", ["explicit", "implicit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sparse", "deeplm"))]
+    "solver",
+    [
+        "explicit",
+        "implicit",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("sparse", "deeplm")),
+    ],
 )
 def test_a_step_is_that_of_the_dense_problem_without_the_columns_of_constants(solver):
     problem = held()
-    options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT) if solver != "deeplm" else NORMAL
+    options = (
+        StepOptions(linear_solver=solver, conjugate_gradients=EXACT)
+        if solver != "deeplm"
+        else NORMAL
+    )
     layout, before = support.start(problem, options)
     after, _ = support.step(layout, before, 1e-3, options, min_gain=-np.inf)
     found = support.difference(problem, support.back(problem, before, after), options)
     residual, jacobian = support.linear(support.tiny(), options)
     moves = ~constant_numbers(problem)
     small = jacobian[:, moves]
-    stacked = np.vstack([small, np.diag(np.sqrt(1e-3 * np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)))])
+    stacked = np.vstack(
+        [small, np.diag(np.sqrt(1e-3 * np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)))]
+    )
     right = np.concatenate([-residual, np.zeros(small.shape[1])])
     wanted = np.zeros(len(moves))
     wanted[moves] = np.linalg.lstsq(stacked, right, rcond=None)[0]
@@ -123,13 +138,20 @@ def moves(problem: BundleProblem) -> np.ndarray:
         (lambda p: hold(p, poses=[0, 3]), 0),
         (lambda p: hold(p, poses="all"), 0),
         (lambda p: hold(p, points=[0, 1, 2]), 0),
-        (lambda p: with_position_priors(p, geometry.camera_centers(p.cameras), stddev=1.0, align=False), 0),
+        (
+            lambda p: with_position_priors(
+                p, geometry.camera_centers(p.cameras), stddev=1.0, align=False
+            ),
+            0,
+        ),
     ],
 )
 def test_a_gauge_holds_what_constants_and_priors_leave_free(fixed, numbers):
     """Counted by hand: a pose is six numbers; a similarity has seven."""
     problem = fixed(support.tiny())
-    held = lambda p: 0 if p.constants is None else p.constants.poses.sum() + 3 * p.constants.points.sum()
+    held = lambda p: (
+        0 if p.constants is None else p.constants.poses.sum() + 3 * p.constants.points.sum()
+    )
     if numbers:
         found = with_gauge(problem, "two-cameras")
     else:
@@ -137,14 +159,28 @@ def test_a_gauge_holds_what_constants_and_priors_leave_free(fixed, numbers):
             found = with_gauge(problem, "two-cameras")
     assert held(found) - held(problem) == numbers
     # pixels determine as much of what is left as before, and nothing of it is free
-    _, jacobian = support.linear(support.tiny(), StepOptions(coordinates=Coordinates(rotation="manifold")))
+    _, jacobian = support.linear(
+        support.tiny(), StepOptions(coordinates=Coordinates(rotation="manifold"))
+    )
     columns = [jacobian[:, moves(p)] for p in (problem, found)]
     ranks = [np.linalg.matrix_rank(x / np.linalg.norm(x, axis=0)) for x in columns]
     if not problem.residuals:
         assert ranks[0] == ranks[1] == columns[1].shape[1]
 
 
-WRONG = [5, None, "x", [[0], [1, 2]], [[1, 2]], [None], [float("nan")], [-1], [99], {"a": 1}, object()]
+WRONG = [
+    5,
+    None,
+    "x",
+    [[0], [1, 2]],
+    [[1, 2]],
+    [None],
+    [float("nan")],
+    [-1],
+    [99],
+    {"a": 1},
+    object(),
+]
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: repr(wrong)[:12])
@@ -152,13 +188,18 @@ def test_wrong_values_are_one_line_in_our_own_words(wrong, unchecked):
     problem = support.tiny()
     centers, eye = geometry.camera_centers(problem.cameras), np.eye(3)
     calls = [
-        *(lambda name=name: hold(problem, **{name: wrong}) for name in ("poses", "rotations", "points", "lenses")),
+        *(
+            lambda name=name: hold(problem, **{name: wrong})
+            for name in ("poses", "rotations", "points", "lenses")
+        ),
         lambda: hold(problem, numbers=wrong),
         lambda: release(problem, numbers=wrong),
         lambda: with_gauge(problem, wrong),
         lambda: with_position_priors(problem, wrong, eye),
         lambda: with_position_priors(problem, centers, wrong if wrong is not None else "none"),
-        lambda: with_position_priors(problem, centers, stddev=wrong if wrong not in (5, None) else -1),
+        lambda: with_position_priors(
+            problem, centers, stddev=wrong if wrong not in (5, None) else -1
+        ),
         lambda: with_position_priors(problem, centers, eye, loss=wrong if wrong is not None else 3),
         lambda: with_position_priors(problem, centers[:1], eye, images=wrong),
         lambda: with_rotation_priors(problem, wrong, eye),
@@ -173,7 +214,15 @@ def test_wrong_values_are_one_line_in_our_own_words(wrong, unchecked):
             call()
         text = str(caught.value)
         assert len(text) < 300
-        foreign = ("object is not", "could not convert", "inhomogeneous", "broadcast", "unhashable", "array(", "ufunc")
+        foreign = (
+            "object is not",
+            "could not convert",
+            "inhomogeneous",
+            "broadcast",
+            "unhashable",
+            "array(",
+            "ufunc",
+        )
         assert not any(words in text for words in foreign), text
 
 
@@ -206,7 +255,9 @@ def test_names_of_groups_and_numbers_say_what_of_lenses_is_constant():
     problem = hold(support.tiny(), numbers=["distortion"])
     assert problem.lenses.free.tolist() == [[True, False, False]] * 6
     assert release(problem, numbers=["k1"]).lenses.free.tolist() == [[True, True, False]] * 6
-    with pytest.raises(ValueError, match="no lens has a number 'k9'; there are focal, principal_point"):
+    with pytest.raises(
+        ValueError, match="no lens has a number 'k9'; there are focal, principal_point"
+    ):
         hold(problem, numbers=["k9"])
     with pytest.raises(ValueError, match="there is no image 6: there are 6"):
         hold(problem, poses=[6])
@@ -219,7 +270,9 @@ def test_names_of_groups_and_numbers_say_what_of_lenses_is_constant():
 
 def test_methods_refuse_what_they_do_not_support():
     known = with_lens_priors(support.tiny(), {"k1": 0.1})
-    with pytest.raises(ProblemError, match="priors and residuals of your own need plain LM, not stba"):
+    with pytest.raises(
+        ProblemError, match="priors and residuals of your own need plain LM, not stba"
+    ):
         solve(known, "ceres", SolveOptions(method=make_method("stba")))
 
 
@@ -233,16 +286,22 @@ def measurements() -> tuple[np.ndarray, np.ndarray]:
     """Positions of four images and rotations of all, with noise."""
     problem, rng = support.tiny(), np.random.default_rng(3)
     centers = geometry.camera_centers(problem.cameras)
-    return centers[:4] + 0.3 * rng.normal(size=(4, 3)), problem.cameras[:, :3] + 0.05 * rng.normal(size=(6, 3))
+    return centers[:4] + 0.3 * rng.normal(size=(4, 3)), problem.cameras[:, :3] + 0.05 * rng.normal(
+        size=(6, 3)
+    )
 
 
 def known() -> BundleProblem:
-    """Positions of four images under a robust loss, rotations of all, and lenses that are believed."""
+    """Positions of four images under a robust loss, rotations of all, and lenses that are
+    believed."""
     centers, turned = measurements()
     given = {"images": [0, 1, 2, 3], "align": False}
-    before = with_position_priors(support.tiny(), centers + 1, stddev=1.0, **given)  # of which nothing stays
+    # of which nothing stays
+    before = with_position_priors(support.tiny(), centers + 1, stddev=1.0, **given)
     problem = with_position_priors(before, centers, np.diag(SPREAD), loss=Loss("huber"), **given)
-    return with_lens_priors(with_rotation_priors(problem, turned, 0.01 * np.eye(3)), {"focal": 20.0, "k1": 0.05})
+    return with_lens_priors(
+        with_rotation_priors(problem, turned, 0.01 * np.eye(3)), {"focal": 20.0, "k1": 0.05}
+    )
 
 
 def prior_residuals(problem: BundleProblem) -> np.ndarray:
@@ -250,7 +309,9 @@ def prior_residuals(problem: BundleProblem) -> np.ndarray:
 
     (centers, turned), cameras = measurements(), np.asarray(problem.cameras)
     position = (geometry.camera_centers(cameras)[:4] - centers) / np.sqrt(SPREAD)
-    rotation = 10 * (Rotation.from_rotvec(cameras[:, :3]) * Rotation.from_rotvec(turned).inv()).as_rotvec()
+    rotation = (
+        10 * (Rotation.from_rotvec(cameras[:, :3]) * Rotation.from_rotvec(turned).inv()).as_rotvec()
+    )
     lens = (cameras - support.tiny().cameras)[:, 6:8] / [20.0, 0.05]
     norms = np.sum(position**2, axis=1)
     huber = np.sqrt(np.where(norms > 1, 2 * np.sqrt(norms) - 1, norms))
@@ -262,18 +323,25 @@ def whole_residuals(problem: BundleProblem) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("policy", "solver"), [("ceres", "explicit"), pytest.param("guarded", "implicit", marks=pytest.mark.slow)]
+    ("policy", "solver"),
+    [("ceres", "explicit"), pytest.param("guarded", "implicit", marks=pytest.mark.slow)],
 )
 def test_scipy_finds_nothing_below_the_end_of_a_solve_with_priors(policy, solver):
     problem = known()
     solution = solve(problem, policy, SolveOptions(linear_solver=solver, max_iterations=200))
-    np.testing.assert_allclose(solution.initial_cost, 0.5 * np.sum(whole_residuals(problem) ** 2), rtol=1e-9)
-    np.testing.assert_allclose(solution.final_cost, 0.5 * np.sum(whole_residuals(solution.problem) ** 2), rtol=1e-9)
+    np.testing.assert_allclose(
+        solution.initial_cost, 0.5 * np.sum(whole_residuals(problem) ** 2), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        solution.final_cost, 0.5 * np.sum(whole_residuals(solution.problem) ** 2), rtol=1e-9
+    )
     end = solution.problem
 
     def residuals(x):
         cameras = x[: end.cameras.size].reshape(end.cameras.shape)
-        return whole_residuals(end.replace(cameras=cameras, points=x[end.cameras.size :].reshape(-1, 3)))
+        return whole_residuals(
+            end.replace(cameras=cameras, points=x[end.cameras.size :].reshape(-1, 3))
+        )
 
     start = np.concatenate([end.cameras.ravel(), end.points.ravel()])
     truth = least_squares(residuals, start, x_scale="jac", max_nfev=5)
@@ -289,11 +357,16 @@ def test_a_scene_is_aligned_with_measured_positions_of_which_some_are_wrong():
     wrong[1] += 100.0
     with pytest.warns(ProblemWarning, match="do not fit the others: camera 1 is 173 from there"):
         aligned = with_position_priors(problem, wrong, 0.01 * np.eye(3))
-    np.testing.assert_allclose(np.delete(geometry.camera_centers(aligned.cameras), 1, 0), np.delete(measured, 1, 0))
+    np.testing.assert_allclose(
+        np.delete(geometry.camera_centers(aligned.cameras), 1, 0), np.delete(measured, 1, 0)
+    )
     np.testing.assert_allclose(geometry.cost(aligned), geometry.cost(problem), rtol=1e-9)
     with pytest.raises(ProblemError, match="an alignment would move what is constant or measured"):
         with_position_priors(hold(problem, poses=[0]), measured, np.eye(3))
-    with pytest.raises(ProblemError, match="covariance of the position of image 0 is not symmetric positive definite"):
+    with pytest.raises(
+        ProblemError,
+        match="covariance of the position of image 0 is not symmetric positive definite",
+    ):
         with_position_priors(problem, measured, -np.eye(3))
 
 
@@ -320,7 +393,9 @@ def test_covariances_are_those_of_the_dense_inverse():
         wanted = np.zeros((3, 3)) if problem.constants.points[point] else np.linalg.inv(own)
         np.testing.assert_allclose(found.points_given_cameras[point], wanted, rtol=1e-7, atol=1e-14)
     pair = np.r_[9:15, 36:42]
-    np.testing.assert_allclose(found.between(1, 4), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-14)
+    np.testing.assert_allclose(
+        found.between(1, 4), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-14
+    )
 
 
 def test_covariances_far_from_the_origin_are_those_near_it():
@@ -332,7 +407,9 @@ def test_covariances_far_from_the_origin_are_those_near_it():
     here, there = covariance(near), covariance(far)
     np.testing.assert_allclose(there.points, here.points, rtol=1e-3)
     np.testing.assert_allclose(there.poses[1, :3, :3], here.poses[1, :3, :3], rtol=1e-3)
-    np.testing.assert_allclose(there.relative_pose(1, 4), here.relative_pose(1, 4), rtol=1e-2, atol=1e-6)
+    np.testing.assert_allclose(
+        there.relative_pose(1, 4), here.relative_pose(1, 4), rtol=1e-2, atol=1e-6
+    )
     fixed = covariance(hold(near, poses="all", lenses="all"))
     assert (fixed.points == fixed.points_given_cameras).all()
 

@@ -42,10 +42,15 @@ def test_a_name_that_no_image_has_means_none(given):
 
 def test_more_of_the_path_tells_images_of_one_name_apart():
     names = ["a/IMG_1.jpg", "b/IMG_1.jpg"]
-    assert named_images([r"D:\survey\B\IMG_1.JPG"], names).positions == {r"D:\survey\B\IMG_1.JPG": 1}
+    assert named_images([r"D:\survey\B\IMG_1.JPG"], names).positions == {
+        r"D:\survey\B\IMG_1.JPG": 1
+    }
     found = named_images(["IMG_1.jpg"], names)
     assert not found.positions
-    assert found.doubts["IMG_1.jpg"] == "a/IMG_1.jpg and b/IMG_1.jpg may both be IMG_1.jpg: give more of the path"
+    assert (
+        found.doubts["IMG_1.jpg"]
+        == "a/IMG_1.jpg and b/IMG_1.jpg may both be IMG_1.jpg: give more of the path"
+    )
 
 
 def test_two_names_do_not_mean_one_image():
@@ -59,7 +64,9 @@ def test_two_names_do_not_mean_one_image():
 
 
 def test_the_last_part_of_a_path_is_that_of_its_system():
-    assert [last_part(name) for name in (r"C:\a\b.jpg", "/a/b.jpg", "b.jpg", "/")] == ["b.jpg"] * 3 + ["/"]
+    assert [last_part(name) for name in (r"C:\a\b.jpg", "/a/b.jpg", "b.jpg", "/")] == [
+        "b.jpg"
+    ] * 3 + ["/"]
 
 
 def test_functions_of_problems_understand_such_names_and_say_what_is_wrong():
@@ -69,7 +76,11 @@ def test_functions_of_problems_understand_such_names_and_say_what_is_wrong():
     held = jaxba.hold(problem, poses=[r"C:\x\img_2.jpg", r"B\IMG_1.JPG"])
     assert held.constants is not None
     assert held.constants.poses.all(axis=1).tolist() == [False, True, True]
-    with pytest.raises(ValueError, match=r"^a/IMG_1.JPG and b/IMG_1.JPG may both be IMG_1.JPG: give more"):
+    with pytest.raises(
+        ValueError, match=r"^a/IMG_1.JPG and b/IMG_1.JPG may both be IMG_1.JPG: give more"
+    ):
         jaxba.hold(problem, poses=["IMG_1.JPG"])
-    with pytest.raises(ValueError, match=r"^there is no image 'IMG_3.JPG'; there is 'a/IMG_1.JPG'$"):
+    with pytest.raises(
+        ValueError, match=r"^there is no image 'IMG_3.JPG'; there is 'a/IMG_1.JPG'$"
+    ):
         jaxba.hold(problem, poses=["IMG_3.JPG"])

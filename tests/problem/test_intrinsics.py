@@ -1,7 +1,7 @@
 """Cameras that share a lens, or keep some of it: steps, solves and refusals.
 
-The truth is the dense least squares problem in which a shared number is one unknown, and a held one none.
-"""
+The truth is the dense least squares problem in which a shared number is one unknown, and a held one
+none."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def grid() -> BundleProblem:
 
 
 def copy_matrix(problem: BundleProblem) -> np.ndarray:
-    """T: a column for every number that is optimised, with a one where a parameter is that number."""
+    """T: a column for every number that is optimised, with a one where a parameter is that
+    number."""
     assert problem.lenses is not None
     columns, names = [], {}
     for parameter in range(problem.cameras.size + problem.points.size):
@@ -101,7 +102,9 @@ def dense_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     [
         StepOptions(),
         StepOptions(coordinates=Coordinates(rotation="manifold")),
-        pytest.param(StepOptions(coordinates=Coordinates(scaling="identity")), marks=pytest.mark.slow),
+        pytest.param(
+            StepOptions(coordinates=Coordinates(scaling="identity")), marks=pytest.mark.slow
+        ),
     ],
     ids=["diagonal", "manifold", "identity"],
 )
@@ -113,7 +116,8 @@ def test_a_step_is_that_of_the_dense_problem_with_shared_lenses(make, options, d
     assert info.accepted
     found = support.difference(problem, support.back(problem, before, after), options)
     wanted = dense_step(problem, options, damping)
-    seen = np.ones(len(wanted), bool)  # the lens of a camera that nobody uses is set when a solve is over
+    # the lens of a camera that nobody uses is set when a solve is over
+    seen = np.ones(len(wanted), bool)
     observed = np.isin(np.arange(problem.num_cameras), problem.camera_index)
     seen[: problem.cameras.size] = np.repeat(observed, 9)
     np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-8 * np.abs(wanted).max())
@@ -140,10 +144,15 @@ def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
 
     def residuals(unknowns):
         every = start + copies @ unknowns
-        cameras, points = every[: problem.cameras.size].reshape(-1, 9), every[problem.cameras.size :].reshape(-1, 3)
+        cameras, points = (
+            every[: problem.cameras.size].reshape(-1, 9),
+            every[problem.cameras.size :].reshape(-1, 3),
+        )
         return geometry.residuals(problem.replace(cameras=cameras, points=points)).ravel()
 
-    truth = least_squares(residuals, np.zeros(copies.shape[1]), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12)
+    truth = least_squares(
+        residuals, np.zeros(copies.shape[1]), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12
+    )
     solution = solve(problem, policy)
     assert solution.converged
     np.testing.assert_allclose(solution.final_cost, truth.cost, rtol=2e-6)
@@ -175,7 +184,9 @@ def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
 @pytest.mark.slow
 def test_a_long_sequence_with_one_lens_is_solved():
     # so long that its reduced camera system is factored as a band, which the lens breaks
-    scene, truth = random_scene_with_truth(SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0)
+    scene, truth = random_scene_with_truth(
+        SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0
+    )
     one_lens = np.zeros(100, int), np.ones((1, 3), bool)
     true = with_lenses(truth, *one_lens)
     noise = np.random.default_rng(0).normal(scale=0.5, size=true.observations.shape)
@@ -197,7 +208,9 @@ def test_a_long_sequence_with_one_lens_is_solved():
 
 def test_fixed_intrinsics_are_fixed_whoever_shares_them():
     problem = shared()
-    after = solve(problem, "bold", StepOptions(intrinsics="fixed", refinement=Refinement(points=3))).problem
+    after = solve(
+        problem, "bold", StepOptions(intrinsics="fixed", refinement=Refinement(points=3))
+    ).problem
     assert (after.cameras[:, 6:] == problem.cameras[:, 6:]).all()
 
 
@@ -212,7 +225,10 @@ def test_a_part_of_a_problem_keeps_its_lenses():
     ("lenses", "message"),
     [
         (Lenses(np.zeros(5, int), FREE), "the lens of cameras must be a vector of 6 integers"),
-        (Lenses(np.array([0, 1, 2, 3, 0, 0]), FREE), r"the lens of cameras\[3\] is 3, outside 0..2"),
+        (
+            Lenses(np.array([0, 1, 2, 3, 0, 0]), FREE),
+            r"the lens of cameras\[3\] is 3, outside 0..2",
+        ),
         (Lenses(INDEX, FREE), "cameras 0 and 2 share lens 0, but differ in f, k1 or k2"),
     ],
 )
@@ -229,9 +245,16 @@ def test_other_methods_refuse_shared_lenses(method):
 
 @pytest.mark.parametrize(
     ("solver", "preconditioner"),
-    [("sparse", "two-level"), ("implicit", "two-level"), ("implicit", "schur-jacobi"), ("cg", "jacobi")],
+    [
+        ("sparse", "two-level"),
+        ("implicit", "two-level"),
+        ("implicit", "schur-jacobi"),
+        ("cg", "jacobi"),
+    ],
 )
-def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lenses(solver, preconditioner):
+def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lenses(
+    solver, preconditioner
+):
     rule = ConjugateGradients(preconditioner, forcing=0.0, tolerance=1e-13, budget=200)
     problem, options = unseen(), StepOptions(linear_solver=solver, conjugate_gradients=rule)
     layout, before = support.start(problem, options)
@@ -240,7 +263,9 @@ def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lens
     found = support.difference(problem, support.back(problem, before, after), options)
     wanted = dense_step(problem, options, 1e-2)
     seen = np.ones(len(wanted), bool)
-    seen[: problem.cameras.size] = np.repeat(np.isin(np.arange(problem.num_cameras), problem.camera_index), 9)
+    seen[: problem.cameras.size] = np.repeat(
+        np.isin(np.arange(problem.num_cameras), problem.camera_index), 9
+    )
     np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-7 * np.abs(wanted).max())
 
 
@@ -256,7 +281,10 @@ def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common()
     # the two changes that all cameras of a lens have in common cost few iterations
     rules = (ConjugateGradients(name) for name in ("two-level", "schur-jacobi"))
     two_level, plain = (
-        solve(problem, "ceres", linear_solver="implicit", conjugate_gradients=rule, max_iterations=5) for rule in rules
+        solve(
+            problem, "ceres", linear_solver="implicit", conjugate_gradients=rule, max_iterations=5
+        )
+        for rule in rules
     )
     assert two_level.history.cg_iterations.sum() < plain.history.cg_iterations.sum()
 
@@ -306,5 +334,6 @@ def test_fixed_intrinsics_are_no_unknowns_and_leave_a_band_a_band():
 def test_the_command_refuses_a_folder_without_a_model(tmp_path, capsys):
     assert run([str(tmp_path)]) == 2
     assert (
-        capsys.readouterr().err == f"error: {tmp_path}: no directory with a COLMAP model (cameras.bin or cameras.txt)\n"
+        capsys.readouterr().err
+        == f"error: {tmp_path}: no directory with a COLMAP model (cameras.bin or cameras.txt)\n"
     )

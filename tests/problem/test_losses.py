@@ -13,8 +13,11 @@ from support import published_loss
 from jaxba import Loss
 from jaxba.problem.losses import NAMES
 
-SQUARES = np.concatenate([[0.0, 1e-300, 1e-12], np.geomspace(1e-6, 1e8, 200), [0.25, 1.0, 4.0, 6.25]])
-"""Squared residuals from zero to outliers, and exactly where a loss of scale 0.5, 1, 2 or 2.5 bends."""
+SQUARES = np.concatenate(
+    [[0.0, 1e-300, 1e-12], np.geomspace(1e-6, 1e8, 200), [0.25, 1.0, 4.0, 6.25]]
+)
+"""Squared residuals from zero to outliers, and exactly where a loss of scale 0.5, 1, 2 or 2.5
+bends."""
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.5])
@@ -79,7 +82,8 @@ def test_single_precision_stays_single(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_no_number_costs_no_number(name):
-    """A point in a camera's plane would else be an outlier like others, and its infinite derivatives spoil the step."""
+    """A point in a camera's plane would else be an outlier like others, and its infinite
+    derivatives spoil the step."""
     value, _ = Loss(name)(jnp.asarray([jnp.inf, jnp.nan]))
     assert not np.isfinite(value).any()
 

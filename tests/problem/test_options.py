@@ -14,9 +14,17 @@ from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions
     [
         (StepOptions, {"linear_solver": "dense"}, "linear_solver must be one of explicit"),
         (StepOptions, {"linear_solver": "auto"}, "linear_solver must be one of explicit"),
-        (StepOptions, {"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
+        (
+            StepOptions,
+            {"intrinsics": "known"},
+            "intrinsics must be one of free, fixed, not 'known'",
+        ),
         (Coordinates, {"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
-        (Coordinates, {"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
+        (
+            Coordinates,
+            {"rotation": "quaternion"},
+            "rotation must be one of angle-axis, manifold, not 'quaternion'",
+        ),
         (Coordinates, {"lens_step": "zoom"}, "lens_step must be one of file, pixels, not 'zoom'"),
         (Refinement, {"points": -1}, "points must be at least 0"),
         (Refinement, {"points": 2.5}, "points must be a whole number, is 2.5"),

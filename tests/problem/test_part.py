@@ -1,4 +1,5 @@
-"""A part of a problem: what does not belong to it stays, bit for bit, and what does is solved as a problem of its own.
+"""A part of a problem: what does not belong to it stays, bit for bit, and what does is solved as a
+problem of its own.
 
 COLMAP's own local bundle adjustment is the truth in tests/io/test_reconstruction.py.
 """
@@ -36,13 +37,16 @@ def test_only_chosen_images_move_and_points_that_others_see_stay(scene):
 
 
 def test_named_points_are_optimised_with_all_that_is_seen_of_them(scene):
-    """The gradient of the whole cost by such a point is zero at the end, and the others do not move."""
+    """The gradient of the whole cost by such a point is zero at the end, and the others do not
+    move."""
     points = seen_by(scene, LOCAL)[:40]
     tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(ftol=1e-14, xtol=1e-12))
     found = jaxba.solve(jaxba.part(scene, images=LOCAL, points=points), options=tight).problem
     moved = np.flatnonzero((found.points != scene.points).any(axis=1))
     assert set(points) <= set(moved)
-    of_point = lambda p: 0.5 * np.sum(geometry.residuals(p)[np.asarray(p.point_index) == points[0]] ** 2)
+    of_point = lambda p: (
+        0.5 * np.sum(geometry.residuals(p)[np.asarray(p.point_index) == points[0]] ** 2)
+    )
 
     def shifted(axis, by):
         array = found.points.copy()
@@ -51,7 +55,10 @@ def test_named_points_are_optimised_with_all_that_is_seen_of_them(scene):
 
     step = 1e-4
     slopes = [(shifted(axis, step) - shifted(axis, -step)) / (2 * step) for axis in range(3)]
-    bends = [(shifted(axis, step) - 2 * of_point(found) + shifted(axis, -step)) / step**2 for axis in range(3)]
+    bends = [
+        (shifted(axis, step) - 2 * of_point(found) + shifted(axis, -step)) / step**2
+        for axis in range(3)
+    ]
     assert (np.abs(slopes) < 1e-4 * np.array(bends)).all()
 
 

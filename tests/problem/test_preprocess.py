@@ -29,12 +29,26 @@ from jaxba.problem.preprocess import FAR, far_middle, perturb, shift
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
 
-ANGLES = [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.5, 3.0, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-12, np.pi]
+ANGLES = [
+    0.0,
+    1e-300,
+    1e-12,
+    1e-8,
+    1e-4,
+    0.5,
+    3.0,
+    np.pi - 1e-4,
+    np.pi - 1e-8,
+    np.pi - 1e-12,
+    np.pi,
+]
 
 
 def axes(seed: int, count: int) -> np.ndarray:
     vectors = np.random.default_rng(seed).standard_normal((count, 3))
-    return np.concatenate([vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    return np.concatenate(
+        [vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.eye(3), -np.eye(3)]
+    )
 
 
 def small_problem(seed: int = 0, **options) -> BundleProblem:
@@ -45,7 +59,9 @@ def small_problem(seed: int = 0, **options) -> BundleProblem:
     cameras[:, 3:6] = rng.standard_normal((5, 3)) - [0, 0, 8]
     cameras[:, 6:] = rng.uniform([500, -0.1, 0.0], [900, 0.0, 0.01], (5, 3))
     points = rng.uniform([-1.7, -2.2, -1.5], [2.3, 1.8, 2.5], (12, 3))
-    camera_index, point_index = (index.ravel() for index in np.meshgrid(np.arange(5), np.arange(12)))
+    camera_index, point_index = (
+        index.ravel() for index in np.meshgrid(np.arange(5), np.arange(12))
+    )
     return BundleProblem.create(
         cameras, points, 30 * rng.standard_normal((60, 2)), camera_index, point_index, **options
     )
@@ -57,32 +73,60 @@ def small_problem(seed: int = 0, **options) -> BundleProblem:
 @pytest.mark.parametrize("angle", [*ANGLES, 4.0, 7.0])
 def test_rotation_matrices_equal_scipy_at_every_angle(angle):
     vectors = angle * axes(1, 20)
-    np.testing.assert_allclose(rotation_matrices(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=4e-15)
+    np.testing.assert_allclose(
+        rotation_matrices(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=4e-15
+    )
 
 
 @pytest.mark.parametrize("angle", ANGLES[:-2])
 def test_angle_axis_inverts_rotation_matrices_up_to_pi(angle):
     vectors = angle * axes(2, 50)
-    np.testing.assert_allclose(angle_axis(rotation_matrices(vectors)), vectors, rtol=0, atol=1e-14 + 1e-9 * angle)
+    np.testing.assert_allclose(
+        angle_axis(rotation_matrices(vectors)), vectors, rtol=0, atol=1e-14 + 1e-9 * angle
+    )
 
 
 def test_angle_axis_inverts_rotation_matrices_up_to_a_half_turn():
     rng = np.random.default_rng(0)
-    angles = np.array([0, 1e-300, 1e-16, 1e-8, 1e-4, 0.1, 1, 2, 3, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-15, np.pi])
-    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(50, 3)), [[1, 1e-9, 0], [1, -1, 0], [0, 1e-5, 1]]])
+    angles = np.array(
+        [
+            0,
+            1e-300,
+            1e-16,
+            1e-8,
+            1e-4,
+            0.1,
+            1,
+            2,
+            3,
+            np.pi - 1e-4,
+            np.pi - 1e-8,
+            np.pi - 1e-15,
+            np.pi,
+        ]
+    )
+    axes = np.concatenate(
+        [np.eye(3), -np.eye(3), rng.normal(size=(50, 3)), [[1, 1e-9, 0], [1, -1, 0], [0, 1e-5, 1]]]
+    )
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     expected = (angles[:, None, None] * axes).reshape(-1, 3)
     found = angle_axis(rotation_matrices(expected))
     # Near a half turn the two directions of the axis stand for nearly the same rotation.
-    flipped = expected * (1 - 2 * np.pi / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9))
-    error = np.minimum(np.linalg.norm(found - expected, axis=1), np.linalg.norm(found - flipped, axis=1))
+    flipped = expected * (
+        1 - 2 * np.pi / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9)
+    )
+    error = np.minimum(
+        np.linalg.norm(found - expected, axis=1), np.linalg.norm(found - flipped, axis=1)
+    )
     assert error.max() < 4e-15
     assert np.linalg.norm(found, axis=1).max() <= np.pi * (1 + 4e-16)
 
 
 def test_tiny_rotations_keep_their_relative_precision():
     vectors = 1e-10 * axes(3, 20)
-    np.testing.assert_allclose(angle_axis(rotation_matrices(vectors)), vectors, rtol=1e-6, atol=1e-26)
+    np.testing.assert_allclose(
+        angle_axis(rotation_matrices(vectors)), vectors, rtol=1e-6, atol=1e-26
+    )
 
 
 @pytest.mark.parametrize("angle", ANGLES[-3:])
@@ -112,7 +156,9 @@ def test_rotations_come_back_from_colmaps_quaternions_of_any_sign_and_norm(angle
 def test_a_half_turn_comes_back_from_colmaps_quaternions_with_either_sign():
     vectors = np.pi * axes(7, 50)
     found = bal_rotations(colmap_quaternions(vectors))
-    np.testing.assert_allclose(found * np.sign((found * vectors).sum(1, keepdims=True)), vectors, atol=2e-15)
+    np.testing.assert_allclose(
+        found * np.sign((found * vectors).sum(1, keepdims=True)), vectors, atol=2e-15
+    )
 
 
 def test_a_quaternion_that_is_no_rotation_gives_no_number():
@@ -127,14 +173,19 @@ def test_a_quaternion_that_is_no_rotation_gives_no_number():
 def test_a_camera_maps_its_centre_to_the_origin():
     cameras = small_problem().cameras
     centers = camera_centers(cameras)
-    np.testing.assert_allclose(Rotation.from_rotvec(cameras[:, :3]).apply(centers) + cameras[:, 3:6], 0, atol=1e-14)
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(cameras[:, :3]).apply(centers) + cameras[:, 3:6], 0, atol=1e-14
+    )
 
 
 def test_projection_is_the_formula_of_bal():
     problem = small_problem()
     for n, predicted in enumerate(project(problem)):
         camera = problem.cameras[problem.camera_index[n]]
-        local = Rotation.from_rotvec(camera[:3]).apply(problem.points[problem.point_index[n]]) + camera[3:6]
+        local = (
+            Rotation.from_rotvec(camera[:3]).apply(problem.points[problem.point_index[n]])
+            + camera[3:6]
+        )
         plane = -local[:2] / local[2]
         square = plane @ plane
         pixels = camera[6] * (1 + camera[7] * square + camera[8] * square**2) * plane
@@ -191,10 +242,14 @@ def test_no_noise_changes_nothing():
 def test_rotation_noise_keeps_the_centres_and_translation_noise_the_rotations():
     problem = small_problem()
     turned = perturb(problem, 0, rotation_sigma=0.1)
-    np.testing.assert_allclose(camera_centers(turned.cameras), camera_centers(problem.cameras), atol=1e-13)
+    np.testing.assert_allclose(
+        camera_centers(turned.cameras), camera_centers(problem.cameras), atol=1e-13
+    )
     assert (turned.cameras[:, :3] != problem.cameras[:, :3]).all()
     moved = perturb(problem, 0, translation_sigma=0.1)
-    np.testing.assert_array_equal(moved.cameras[:, [0, 1, 2, 6, 7, 8]], problem.cameras[:, [0, 1, 2, 6, 7, 8]])
+    np.testing.assert_array_equal(
+        moved.cameras[:, [0, 1, 2, 6, 7, 8]], problem.cameras[:, [0, 1, 2, 6, 7, 8]]
+    )
     assert (moved.cameras[:, 3:6] != problem.cameras[:, 3:6]).all()
 
 
@@ -202,7 +257,9 @@ def test_the_noise_has_the_asked_sigma():
     rng = np.random.default_rng(7)
     cameras = np.concatenate([rng.standard_normal((5000, 6)), np.full((5000, 3), 1.0)], axis=1)
     zeros = np.zeros(5000, dtype=int)
-    problem = BundleProblem.create(cameras, rng.standard_normal((5000, 3)), np.zeros((5000, 2)), zeros, zeros)
+    problem = BundleProblem.create(
+        cameras, rng.standard_normal((5000, 3)), np.zeros((5000, 2)), zeros, zeros
+    )
     noisy = perturb(problem, 8, 0.02, 0.3, 0.05)
     centers = camera_centers(noisy.cameras) - camera_centers(problem.cameras)
     for noise, sigma in (
@@ -274,7 +331,8 @@ def test_only_scenes_far_from_the_origin_for_their_extent_are_far():
 
 @pytest.mark.parametrize(("dtype", "rtol"), [("float64", 1e-10), ("float32", 1e-3)])
 def test_a_scene_far_from_the_origin_is_solved_as_if_it_stood_there(dtype, rtol):
-    """As one in the coordinates of a country's grid: in float32 not even its start could be told from others."""
+    """As one in the coordinates of a country's grid: in float32 not even its start could be told
+    from others."""
     offset = np.array([4e5, 5.6e6, 300.0])
     problem = support.at_origin(support.tiny())
     far = shift(problem, offset)
@@ -282,7 +340,8 @@ def test_a_scene_far_from_the_origin_is_solved_as_if_it_stood_there(dtype, rtol)
     if dtype == "float64":  # in float32 rounding decides when the cost no longer falls
         assert there.iterations == near.iterations
     np.testing.assert_allclose(there.final_cost, near.final_cost, rtol=rtol)
-    # put back where it was, every coordinate is rounded: what one rounding can do to the cost, at most
+    # put back where it was, every coordinate is rounded: what one rounding can do to the cost, at
+    # most
     rays = near.problem.cameras[near.problem.camera_index]
     scale = rays[:, 6] / np.abs(depths(near.problem))  # pixels, of a unit
     rounded = np.spacing(offset.max()) * np.sum(np.abs(residuals(near.problem)) * scale[:, None])

@@ -67,12 +67,16 @@ def test_a_tree_is_rebuilt_without_the_checks_of_its_constructor():
 def test_trees_hold_whatever_jax_puts_in_the_place_of_arrays(make):
     tree = make()
     assert type(jax.tree.map(lambda _: None, tree)) is type(tree)
-    shapes = jax.eval_shape(lambda tree: jax.tree.map(lambda x: x[None], jax.tree.map(jax.numpy.asarray, tree)), tree)
+    shapes = jax.eval_shape(
+        lambda tree: jax.tree.map(lambda x: x[None], jax.tree.map(jax.numpy.asarray, tree)), tree
+    )
     assert {leaf.shape[0] for leaf in jax.tree.leaves(shapes)} == {1}
 
 
 def test_types_are_checked_where_people_call():
     with pytest.raises(jaxtyping.TypeCheckError):
-        BundleProblem(np.zeros((1, 9)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int))
+        BundleProblem(
+            np.zeros((1, 9)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int)
+        )
     with pytest.raises(jaxtyping.TypeCheckError):
         Lenses(np.zeros(3, int), np.ones((1, 3), int))

@@ -1,4 +1,5 @@
-"""Rigs: the step is that of the dense problem of frames, and cameras of a frame stay where their rig has them."""
+"""Rigs: the step is that of the dense problem of frames, and cameras of a frame stay where their
+rig has them."""
 
 from __future__ import annotations
 
@@ -38,29 +39,43 @@ EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-13)
 
 
 def rigged(shared: bool = True) -> BundleProblem:
-    """Six cameras in four frames, two of them of two cameras; the second is turned and moved in its rig."""
+    """Six cameras in four frames, two of them of two cameras; the second is turned and moved in its
+    rig."""
     plain, rng = support.tiny(), np.random.default_rng(0)
     matrices = geometry.rotation_matrices(plain.cameras[:, :3])
-    cameras, rotation, translation = np.array(plain.cameras), np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3))
-    rotation[0] = Rotation.from_rotvec([0.3, 0.1, -0.2]).as_matrix()  # also the first may be anywhere
+    cameras, rotation, translation = (
+        np.array(plain.cameras),
+        np.tile(np.eye(3), (6, 1, 1)),
+        np.zeros((6, 3)),
+    )
+    # also the first may be anywhere
+    rotation[0] = Rotation.from_rotvec([0.3, 0.1, -0.2]).as_matrix()
     for second, first in ((2, 0), (4, 1)):
         rotation[second] = matrices[second] @ matrices[first].T @ rotation[first]
-        translation[second] = cameras[second, 3:6] - rotation[second] @ rotation[first].T @ cameras[first, 3:6]
+        translation[second] = (
+            cameras[second, 3:6] - rotation[second] @ rotation[first].T @ cameras[first, 3:6]
+        )
     index = np.array([0, 1, 1, 0, 1, 0])
     if shared:
         cameras[:, 6:] = cameras[index, 6:]
     parts = support.arrays(plain)[1:]
     lenses = Lenses(index, np.ones((2, 3), bool)) if shared else None
-    problem = BundleProblem.create(cameras, *parts, lenses=lenses, rigs=Rigs(FRAME, rotation, translation))
+    problem = BundleProblem.create(
+        cameras, *parts, lenses=lenses, rigs=Rigs(FRAME, rotation, translation)
+    )
     pixels = geometry.project(problem) + 0.3 * rng.normal(size=problem.observations.shape)
     return problem.replace(observations=pixels)
 
 
 def stereo() -> BundleProblem:
-    """Six cameras in four frames, two of them of two cameras: the second has a lens of its own, and is not quite where
-    its rig says it is."""
+    """Six cameras in four frames, two of them of two cameras: the second has a lens of its own, and
+    is not quite where its rig says it is."""
     plain, rng = support.tiny(), np.random.default_rng(1)
-    cameras, rotation, translation = np.array(plain.cameras), np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3))
+    cameras, rotation, translation = (
+        np.array(plain.cameras),
+        np.tile(np.eye(3), (6, 1, 1)),
+        np.zeros((6, 3)),
+    )
     index = np.array([0, 0, 1, 0, 1, 0])
     cameras[:, 6:] = cameras[index, 6:]
     matrices = geometry.rotation_matrices(cameras[:, :3])
@@ -72,15 +87,20 @@ def stereo() -> BundleProblem:
             cameras[second, 3:6] = rotation[2] @ cameras[first, 3:6] + translation[2]
 
     place([0.1, 0.05, -0.1], [0.3, -0.2, 0.1])
-    pixels = geometry.project(plain.replace(cameras=cameras)) + 0.3 * rng.normal(size=plain.observations.shape)
+    pixels = geometry.project(plain.replace(cameras=cameras)) + 0.3 * rng.normal(
+        size=plain.observations.shape
+    )
     place([0.11, 0.04, -0.1], [0.35, -0.2, 0.15])
     rigs = Rigs(FRAME, rotation, translation, index == 1)
     parts = (plain.points, pixels, plain.camera_index, plain.point_index)
-    return BundleProblem.create(cameras, *parts, lenses=Lenses(index, np.ones((2, 3), bool)), rigs=rigs)
+    return BundleProblem.create(
+        cameras, *parts, lenses=Lenses(index, np.ones((2, 3), bool)), rigs=rigs
+    )
 
 
 def copies_of(problem: BundleProblem) -> tuple[dict, np.ndarray]:
-    """The unknowns, and T: the steps of all parameters (rotations on the manifold) for unit steps of them."""
+    """The unknowns, and T: the steps of all parameters (rotations on the manifold) for unit steps
+    of them."""
     size, names, columns = 9 * 6 + 3 * problem.num_points, {}, []
     rigs = problem.rigs
     free = np.zeros(6, bool) if rigs.free is None else rigs.free
@@ -95,7 +115,9 @@ def copies_of(problem: BundleProblem) -> tuple[dict, np.ndarray]:
         for part in (0, 3):
             for k in range(3):
                 rows = slice(9 * camera + part, 9 * camera + part + 3)
-                column(("frame", int(FRAME[camera]), part + k))[rows] = problem.rigs.rotation[camera][:, k]
+                column(("frame", int(FRAME[camera]), part + k))[rows] = problem.rigs.rotation[
+                    camera
+                ][:, k]
         for k in range(6, 9):
             lens = camera if problem.lenses is None else int(problem.lenses.index[camera])
             column(("lens", lens, k))[9 * camera + k] = 1
@@ -116,11 +138,15 @@ def unknown_step(problem: BundleProblem, names: dict, before, after) -> np.ndarr
     change = new - old
     for at in (0, 9):
         turned = (
-            Rotation.from_rotvec(new[:, at : at + 3].copy()) * Rotation.from_rotvec(old[:, at : at + 3].copy()).inv()
+            Rotation.from_rotvec(new[:, at : at + 3].copy())
+            * Rotation.from_rotvec(old[:, at : at + 3].copy()).inv()
         )
         change[:, at : at + 3] = turned.as_rotvec()
     points = (support.back(problem, before, after).points - problem.points).ravel()
-    at = {"frame": (FRAME, 0), "place": (problem.lenses.index if problem.lenses is not None else np.arange(6), 9)}
+    at = {
+        "frame": (FRAME, 0),
+        "place": (problem.lenses.index if problem.lenses is not None else np.arange(6), 9),
+    }
     at["lens"] = (at["place"][0], 0)
     found = []
     for kind, *number in names:
@@ -135,11 +161,19 @@ def unknown_step(problem: BundleProblem, names: dict, before, after) -> np.ndarr
 
 
 RIGGED = {"shared": rigged, "own": lambda: rigged(shared=False), "free": stereo}
-QUICK = [("shared", "explicit"), ("shared", "implicit"), ("own", "sparse"), ("free", "explicit"), ("free", "sparse")]
+QUICK = [
+    ("shared", "explicit"),
+    ("shared", "implicit"),
+    ("own", "sparse"),
+    ("free", "explicit"),
+    ("free", "sparse"),
+]
 REST = [("own", "explicit"), ("own", "implicit"), ("shared", "sparse"), ("free", "implicit")]
 
 
-@pytest.mark.parametrize(("make", "solver"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in REST)])
+@pytest.mark.parametrize(
+    ("make", "solver"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in REST)]
+)
 def test_a_step_is_that_of_the_dense_problem_of_frames(make, solver):
     problem = RIGGED[make]()
     options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT, coordinates=MANIFOLD)
@@ -149,7 +183,9 @@ def test_a_step_is_that_of_the_dense_problem_of_frames(make, solver):
     names, copies = copies_of(problem)
     found = unknown_step(problem, names, before, after)
     small = jacobian @ copies
-    stacked = np.vstack([small, np.diag(np.sqrt(1e-2 * np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)))])
+    stacked = np.vstack(
+        [small, np.diag(np.sqrt(1e-2 * np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)))]
+    )
     right = np.concatenate([-residual, np.zeros(small.shape[1])])
     wanted = np.linalg.lstsq(stacked, right, rcond=None)[0]
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
@@ -161,8 +197,11 @@ def test_where_a_camera_is_in_its_rig_is_found(policy):
     problem = stereo()
     found = solve(problem, policy).problem
     parts = (found.cameras, *support.arrays(found)[1:])
-    BundleProblem.create(*parts, lenses=found.lenses, rigs=found.rigs)  # refuses cameras that are elsewhere
-    assert geometry.cost(found) < 0.9 * geometry.cost(solve(problem.replace(rigs=held(problem)), policy).problem)
+    # refuses cameras that are elsewhere
+    BundleProblem.create(*parts, lenses=found.lenses, rigs=found.rigs)
+    assert geometry.cost(found) < 0.9 * geometry.cost(
+        solve(problem.replace(rigs=held(problem)), policy).problem
+    )
     assert support.same_bits(found.rigs.rotation[[0, 1, 3, 5]], problem.rigs.rotation[[0, 1, 3, 5]])
     # the truth, but for the scale of the scene and noise
     turn = Rotation.from_matrix(found.rigs.rotation[2]).as_rotvec()
@@ -192,7 +231,9 @@ def test_cameras_of_a_frame_stay_where_their_rig_has_them(policy):
     BundleProblem.create(*parts, rigs=after.rigs)  # refuses cameras that are elsewhere
     assert geometry.cost(after) < 0.7 * geometry.cost(problem)
     # what is constant of one camera is constant in its frame
-    np.testing.assert_allclose(after.cameras[[1, 4], :6], problem.cameras[[1, 4], :6], rtol=0, atol=0)
+    np.testing.assert_allclose(
+        after.cameras[[1, 4], :6], problem.cameras[[1, 4], :6], rtol=0, atol=0
+    )
 
 
 @pytest.mark.parametrize("make", [rigged, pytest.param(stereo, marks=pytest.mark.slow)])
@@ -212,7 +253,9 @@ def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera(make):
         at = slice(9 * camera, 9 * camera + 6)
         np.testing.assert_allclose(found.poses[camera], whole[at, at], rtol=1e-5, atol=1e-12)
     pair = np.r_[0:6, 18:24]
-    np.testing.assert_allclose(found.between(0, 2), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        found.between(0, 2), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -236,7 +279,10 @@ def test_priors_are_of_cameras_and_not_of_their_frames():
     here = in_frames(found.problem)
     for _ in range(20):
         moved = np.array(here.cameras)
-        by_frame, by_lens = 1e-4 * rng.normal(size=(4, 6)), 1e-4 * rng.normal(size=(2, 6)) * [[0], [1]]
+        by_frame, by_lens = (
+            1e-4 * rng.normal(size=(4, 6)),
+            1e-4 * rng.normal(size=(2, 6)) * [[0], [1]],
+        )
         moved[:, :6] += by_frame[FRAME]
         moved[:, -6:] += by_lens[problem.lenses.index]
         cameras, rigs = out_of_frames(found.problem, moved)
@@ -247,22 +293,36 @@ def test_what_is_held_of_a_camera_is_held_of_its_frame_and_its_place():
     problem = stereo()
     poses = np.zeros((6, 6), bool)
     poses[2, 3:] = True
-    held_translation = problem.replace(constants=Constants(poses, np.zeros(problem.num_points, bool)))
+    held_translation = problem.replace(
+        constants=Constants(poses, np.zeros(problem.num_points, bool))
+    )
     unseen = problem.camera_index != 2
-    parts = (problem.observations[unseen], problem.camera_index[unseen], problem.point_index[unseen])
-    blind = BundleProblem.create(problem.cameras, problem.points, *parts, lenses=problem.lenses, rigs=problem.rigs)
+    parts = (
+        problem.observations[unseen],
+        problem.camera_index[unseen],
+        problem.point_index[unseen],
+    )
+    blind = BundleProblem.create(
+        problem.cameras, problem.points, *parts, lenses=problem.lenses, rigs=problem.rigs
+    )
     for here, numbers in ((held_translation, slice(3, 6)), (hold(blind, poses=[2]), slice(6))):
         found = solve(here, "ceres", SolveOptions(max_iterations=5))
-        np.testing.assert_array_equal(found.problem.cameras[2, numbers], problem.cameras[2, numbers])
+        np.testing.assert_array_equal(
+            found.problem.cameras[2, numbers], problem.cameras[2, numbers]
+        )
         np.testing.assert_allclose(geometry.cost(found.problem), found.final_cost, rtol=1e-9)
-        BundleProblem.create(found.problem.cameras, *support.arrays(found.problem)[1:], rigs=held(found.problem))
+        BundleProblem.create(
+            found.problem.cameras, *support.arrays(found.problem)[1:], rigs=held(found.problem)
+        )
 
 
 def test_a_camera_that_nothing_sees_moves_with_its_frame():
     problem = rigged()
     seen = problem.camera_index != 2
     parts = (problem.observations[seen], problem.camera_index[seen], problem.point_index[seen])
-    blind = BundleProblem.create(problem.cameras, problem.points, *parts, lenses=problem.lenses, rigs=problem.rigs)
+    blind = BundleProblem.create(
+        problem.cameras, problem.points, *parts, lenses=problem.lenses, rigs=problem.rigs
+    )
     after = solve(blind, "ceres").problem
     assert (after.cameras[2, :6] != problem.cameras[2, :6]).any()
     BundleProblem.create(after.cameras, *support.arrays(after)[1:], rigs=after.rigs)
@@ -277,7 +337,9 @@ def one_sensor() -> BundleProblem:
 @pytest.mark.slow
 def test_what_is_measured_of_a_camera_without_pixels_moves_its_frame():
     problem, images, seen = one_sensor(), [2, 4, 3, 5], [0, 1, 3, 5]
-    measured = geometry.camera_centers(problem.cameras)[images] + np.random.default_rng(0).normal(size=(4, 3))
+    measured = geometry.camera_centers(problem.cameras)[images] + np.random.default_rng(0).normal(
+        size=(4, 3)
+    )
     options = SolveOptions(tolerances=Tolerances(ftol=1e-12), max_iterations=300)
     surveyed = with_position_priors(problem, measured, stddev=0.1, images=images, align=False)
     found = solve(surveyed, "ceres", options)
@@ -286,7 +348,9 @@ def test_what_is_measured_of_a_camera_without_pixels_moves_its_frame():
     # as if the cameras with pixels had the measurements, by lever arms in COLMAP's axes
     turn, place = np.asarray(problem.rigs.rotation), np.asarray(problem.rigs.translation)
     arms = place[seen] - np.einsum("nij,nkj,nk->ni", turn[seen], turn[images], place[images])
-    rows = residuals.position(pose=seen, position=measured, lever_arm=arms * [1, -1, -1], whitening=10 * np.eye(3))
+    rows = residuals.position(
+        pose=seen, position=measured, lever_arm=arms * [1, -1, -1], whitening=10 * np.eye(3)
+    )
     alone = solve(with_residual(problem.replace(rigs=None), rows), "ceres", options)
     np.testing.assert_allclose(found.initial_cost, alone.initial_cost, rtol=1e-9)
     np.testing.assert_allclose(found.final_cost, alone.final_cost, rtol=1e-6)
@@ -307,7 +371,10 @@ def test_a_constant_camera_without_pixels_holds_its_frame():
 def test_rigs_grow_with_their_scene():
     problem = rigged()
     centers = geometry.camera_centers(problem.cameras)
-    for larger in (with_position_priors(problem, 3 * centers + 1, 1e-4 * np.eye(3)), support.at_origin(problem)):
+    for larger in (
+        with_position_priors(problem, 3 * centers + 1, 1e-4 * np.eye(3)),
+        support.at_origin(problem),
+    ):
         BundleProblem.create(larger.cameras, *support.arrays(larger)[1:], rigs=larger.rigs)
 
 
@@ -322,21 +389,38 @@ def test_what_rigs_do_not_support_is_one_line():
     part = np.zeros((6, 6), bool)
     part[2, 4] = True
     constants = Constants(part, np.zeros(problem.num_points, bool))
-    with pytest.raises(ProblemError, match="part of the translation of camera 2 is constant, which is turned"):
+    with pytest.raises(
+        ProblemError, match="part of the translation of camera 2 is constant, which is turned"
+    ):
         solve(problem.replace(constants=constants), "ceres")
     wrong = np.array(rigs.translation)
     wrong[2] += 1.0
-    with pytest.raises(ProblemError, match="cameras 0 and 2 of one frame are not where their rig has them"):
+    with pytest.raises(
+        ProblemError, match="cameras 0 and 2 of one frame are not where their rig has them"
+    ):
         BundleProblem.create(*support.arrays(problem), rigs=Rigs(rigs.frame, rigs.rotation, wrong))
-    for at, value in ((3, np.zeros((3, 3))), (3, np.diag([1.0, 1.0, -1.0])), (2, np.full((3, 3), np.nan))):
+    for at, value in (
+        (3, np.zeros((3, 3))),
+        (3, np.diag([1.0, 1.0, -1.0])),
+        (2, np.full((3, 3), np.nan)),
+    ):
         bad = np.array(rigs.rotation)
         bad[at] = value
-        with pytest.raises(ProblemError, match=f"the place of camera {at} in its rig is no rotation and translation"):
-            BundleProblem.create(*support.arrays(problem), rigs=Rigs(rigs.frame, bad, rigs.translation))
-    free = Rigs(*[getattr(rigs, name) for name in ("frame", "rotation", "translation")], np.ones(6, bool))
+        with pytest.raises(
+            ProblemError,
+            match=f"the place of camera {at} in its rig is no rotation and translation",
+        ):
+            BundleProblem.create(
+                *support.arrays(problem), rigs=Rigs(rigs.frame, bad, rigs.translation)
+            )
+    free = Rigs(
+        *[getattr(rigs, name) for name in ("frame", "rotation", "translation")], np.ones(6, bool)
+    )
     with pytest.raises(ProblemError, match="free extrinsics of rigs need lenses"):
         BundleProblem.create(*support.arrays(problem), rigs=free)
-    with pytest.raises(ProblemError, match="cameras 1 and 2 share a lens, but are in different places"):
+    with pytest.raises(
+        ProblemError, match="cameras 1 and 2 share a lens, but are in different places"
+    ):
         BundleProblem.create(*support.arrays(problem), lenses=problem.lenses, rigs=free)
 
 
@@ -345,4 +429,6 @@ def test_arrays_that_cannot_be_written_are_read():
     problem = rigged()
     cameras = np.array(problem.cameras)
     cameras.flags.writeable = False
-    assert support.same_bits(in_frames(problem.replace(cameras=cameras)).cameras, in_frames(problem).cameras)
+    assert support.same_bits(
+        in_frames(problem.replace(cameras=cameras)).cameras, in_frames(problem).cameras
+    )

@@ -1,4 +1,5 @@
-"""Embedded iterations: cameras alone, shorter trials, repairs; against SciPy, dense algebra and plain evaluation."""
+"""Embedded iterations: cameras alone, shorter trials, repairs; against SciPy, dense algebra and
+plain evaluation."""
 
 from __future__ import annotations
 
@@ -42,7 +43,9 @@ pytestmark = pytest.mark.step
 
 PLAIN = StepOptions()
 SHORTER_ONLY = StepOptions(refinement=Refinement(trials=4))
-EVERYTHING = StepOptions(refinement=Refinement(points=3, trials=4, camera_rounds=3, pattern_moves=4))
+EVERYTHING = StepOptions(
+    refinement=Refinement(points=3, trials=4, camera_rounds=3, pattern_moves=4)
+)
 MOVES_ONLY = StepOptions(refinement=Refinement(pattern_moves=4))
 
 BOLD = 1e-8
@@ -65,7 +68,9 @@ def turned(seed: int, size: float) -> BundleProblem:
 def far(seed: int) -> BundleProblem:
     """`turned`, with points far from where they belong as well."""
     problem = turned(seed, 1.0)
-    return problem.replace(points=problem.points + np.random.default_rng(100 + seed).normal(size=problem.points.shape))
+    return problem.replace(
+        points=problem.points + np.random.default_rng(100 + seed).normal(size=problem.points.shape)
+    )
 
 
 def camera_costs(problem: BundleProblem) -> np.ndarray:
@@ -92,11 +97,16 @@ def test_small_systems_are_solved_as_lapack_solves_them(seed, decades):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(7, 9, 12))
     scale = 10.0 ** rng.uniform(-abs(decades), abs(decades), size=(7, 9, 1))
-    matrix, right = (scale * root) @ (scale * root).transpose(0, 2, 1), scale[:, :, 0] * rng.normal(size=(7, 9))
+    matrix, right = (
+        (scale * root) @ (scale * root).transpose(0, 2, 1),
+        scale[:, :, 0] * rng.normal(size=(7, 9)),
+    )
     found = np.asarray(solve_positive(jnp.asarray(matrix), jnp.asarray(right)))
     expected = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
     # in the units of the scale, where the systems are well conditioned
-    np.testing.assert_allclose(found * scale[:, :, 0], expected * scale[:, :, 0], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(
+        found * scale[:, :, 0], expected * scale[:, :, 0], rtol=1e-7, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(("seed", "size"), [(0, 0.0), (1, 0.1), (2, 1.0), (3, 3.0), (4, 20.0)])
@@ -108,7 +118,8 @@ def test_no_camera_gets_worse_and_points_are_not_touched(seed, size):
 
 
 def test_a_round_is_a_damped_gauss_newton_step_of_each_camera():
-    """On the manifold, by the Jacobian of support.py; where the first damping does not help, the second."""
+    """On the manifold, by the Jacobian of support.py; where the first damping does not help, the
+    second."""
     manifold = StepOptions(coordinates=Coordinates(rotation="manifold"))
     helped = 0
     for seed, size in ((1, 0.1), (2, 0.5), (5, 2.0)):
@@ -144,7 +155,13 @@ def test_every_camera_ends_where_scipy_ends_on_that_camera_alone():
             return (support.distort(local[:, :2] / -local[:, 2:], intrinsics) - seen).ravel()
 
         best = least_squares(
-            residuals, problem.cameras[camera], x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=2000
+            residuals,
+            problem.cameras[camera],
+            x_scale="jac",
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
+            max_nfev=2000,
         )
         assert best.cost <= once[camera] * (1 + 1e-9)
         np.testing.assert_allclose(found[camera], best.cost, rtol=1e-5)
@@ -219,7 +236,8 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         after, info = step(layout, before, BOLD, SHORTER_ONLY)
         if once.accepted:  # then nothing is tried again
             assert (info.repairs, info.step_fraction) == (0, 1)
-            # another program, which rounds in another order, and this lambda divides rounding by 1e-8
+            # another program, which rounds in another order, and this lambda divides rounding by
+            # 1e-8
             chex.assert_trees_all_close(after, same, rtol=1e-9, atol=1e-9)
             continue
         chex.assert_trees_all_equal(same, before, strict=True)
@@ -235,7 +253,10 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         assert power in (1, 2, 3)
         costs = []
         for share in SHORTER ** np.arange(power + 1.0):
-            cameras, points = before.cameras + share * whole.cameras, before.points + share * whole.points
+            cameras, points = (
+                before.cameras + share * whole.cameras,
+                before.points + share * whole.points,
+            )
             costs.append(float(_cost(layout, cameras, points, PLAIN.loss)))
         assert not min(costs[:-1]) < before.cost  # no longer share would have done
         np.testing.assert_allclose(after.cameras, cameras, rtol=1e-9, atol=1e-9)
@@ -248,7 +269,9 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
 
 @functools.partial(jax.jit, static_argnames=("options", "min_gain"))
 def _best_candidate(layout, cameras, points, cost, reference, whole, options, min_gain):
-    return best_candidate(comparison(layout, cameras, points, cost, reference, whole, options, min_gain))
+    return best_candidate(
+        comparison(layout, cameras, points, cost, reference, whole, options, min_gain)
+    )
 
 
 def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
@@ -256,7 +279,9 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
     whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(1e-3), PLAIN)
     mirrored = whole._replace(cameras=whole.cameras.at[6, 0].set(-1.5 * before.cameras[6, 0]))
-    found = lambda options: _best_candidate(layout, *before[:3], linear.reference, mirrored, options, 0.0)
+    found = lambda options: _best_candidate(
+        layout, *before[:3], linear.reference, mirrored, options, 0.0
+    )
     plain, kept = found(PLAIN), found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
     assert not plain.accepted
@@ -265,7 +290,9 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     np.testing.assert_allclose(kept.cameras[:, 1:], plain.cameras[:, 1:], rtol=1e-12)
 
 
-@pytest.mark.parametrize("options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"])
+@pytest.mark.parametrize(
+    "options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"]
+)
 def test_the_cost_never_rises_and_is_that_of_the_parameters(options):
     accepted = 0
     for problem in (support.tiny(), turned(2, 0.3), far(0), far(1), far(2)):
@@ -274,12 +301,16 @@ def test_the_cost_never_rises_and_is_that_of_the_parameters(options):
             after, info = step(layout, before, damping, options)
             assert info.cost <= info.previous_cost
             assert after.cost == info.cost
-            np.testing.assert_allclose(info.cost, geometry.cost(support.back(problem, before, after)), rtol=1e-9)
+            np.testing.assert_allclose(
+                info.cost, geometry.cost(support.back(problem, before, after)), rtol=1e-9
+            )
             accepted += int(info.accepted)
     assert accepted >= 5
 
 
-@pytest.mark.parametrize("options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"])
+@pytest.mark.parametrize(
+    "options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"]
+)
 def test_a_refused_step_leaves_every_bit_alone(options):
     for problem in (turned(2, 0.3), far(0)):
         layout, before = start(problem)
@@ -296,7 +327,8 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
     for layout, before in wide():
         plain = step(layout, before, BOLD, PLAIN)[1]
         mended = step(layout, before, BOLD, rounds)[1]
-        # two programs under a lambda that divides rounding by 1e-8, though not in directions that cost much
+        # two programs under a lambda that divides rounding by 1e-8, though not in directions that
+        # cost much
         np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-10)
         assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-10)
         better += bool(mended.candidate_cost < 0.9 * plain.candidate_cost)
@@ -312,22 +344,28 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
 
 @pytest.mark.slow
 def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatch):
-    """What one round and two leave shows who is to have the next; limits in the middle of these, so that some are."""
+    """What one round and two leave shows who is to have the next; limits in the middle of these, so
+    that some are."""
     scenes = wide()
     monkeypatch.setattr(candidates, "MAX_COST_RATIO", np.inf)
 
     def repaired(rounds: int, *limits: float) -> tuple[np.ndarray, np.ndarray]:
         monkeypatch.setattr(candidates, "MIN_GAINS", limits)
         options = StepOptions(refinement=Refinement(camera_rounds=rounds))
-        once = jax.jit(lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1])
+        once = jax.jit(
+            lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1]
+        )
         infos = [once(*scene) for scene in scenes]
-        return np.array([info.repairs for info in infos]), np.array([info.gain_ratio for info in infos])
+        return np.array([info.repairs for info in infos]), np.array(
+            [info.gain_ratio for info in infos]
+        )
 
     done, gain = repaired(1, -np.inf, -np.inf)
     limits: list[float] = []
     for rounds in (2, 3):
         lacks = (done == rounds - 1) & (gain < GOOD_GAIN)
-        ordered = np.sort(gain[lacks])  # between two of them: the next program may round differently
+        # between two of them: the next program may round differently
+        ordered = np.sort(gain[lacks])
         limits.append(float(np.mean(ordered[len(ordered) // 2 - 1 :][:2])))
         going_on = lacks & (gain > limits[-1])
         assert 0 < going_on.sum() < lacks.sum()
@@ -346,11 +384,15 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
         full = step(layout, before, BOLD, with_rounds, min_gain=0.25)[1]
         shortened = round(float(np.log(full.step_fraction) / np.log(SHORTER)))
         assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_LATER_CANDIDATES)
-        assert full.step_fraction >= bare.step_fraction  # what a round brings in need not be shortened further
+        # what a round brings in need not be shortened further
+        assert full.step_fraction >= bare.step_fraction
         if full.step_fraction == bare.step_fraction:
-            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-10)  # two programs, as above
+            # two programs, as above
+            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-10)
         lower = full.candidate_cost < 0.999 * bare.candidate_cost
-        better += bool(full.step_fraction < 1 and (full.step_fraction > bare.step_fraction or lower))
+        better += bool(
+            full.step_fraction < 1 and (full.step_fraction > bare.step_fraction or lower)
+        )
     assert better >= 1
 
 
@@ -369,8 +411,11 @@ def test_a_predicted_decrease_too_small_to_matter_is_tried_once():
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("damping", [1e-2, 1.0, 1e2])
-def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while_that_costs_less(seed, damping):
-    """Where damping holds a step back: the end is 1, 2, 4, 8 or 16 ways off, by costs that NumPy evaluates."""
+def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while_that_costs_less(
+    seed, damping
+):
+    """Where damping holds a step back: the end is 1, 2, 4, 8 or 16 ways off, by costs that NumPy
+    evaluates."""
     problem = turned(seed, 0.2)
     layout, before = start(problem, PLAIN)
     once, short = step(layout, before, damping, PLAIN)
@@ -384,7 +429,10 @@ def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while
 
     costs = [cost_at(2.0**k) for k in range(5)]
     last = next((k for k in range(4) if not costs[k + 1] < costs[k]), 4)
-    held_back = short.damping_fraction > SMALL_DAMPING_FRACTION or abs(short.gain_ratio - 1) > GAIN_TOLERANCE
+    held_back = (
+        short.damping_fraction > SMALL_DAMPING_FRACTION
+        or abs(short.gain_ratio - 1) > GAIN_TOLERANCE
+    )
     last = last if held_back else 0
     np.testing.assert_allclose(info.cost, costs[last], rtol=1e-9)
     tried = min(last + 1, 4) if held_back else 0
@@ -395,7 +443,8 @@ def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while
 
 
 def test_a_step_that_did_what_was_promised_is_not_followed():
-    """Newton's, close to the minimum: nothing is tried beyond it, and it ends where it does without pattern moves."""
+    """Newton's, close to the minimum: nothing is tried beyond it, and it ends where it does without
+    pattern moves."""
     problem = turned(1, 1e-3)
     layout, before = start(problem, PLAIN)
     free = step(layout, before, BOLD, PLAIN)
@@ -420,7 +469,10 @@ def test_pattern_moves_make_no_step_worse_and_a_crawl_shorter():
     """A large lambda throughout, whose steps crawl."""
     problem = turned(2, 0.2)
     lowest = solve(problem, "ceres").final_cost
-    plain, moved = (solve(problem, make_policy("constant:1"), options).final_cost for options in (PLAIN, MOVES_ONLY))
+    plain, moved = (
+        solve(problem, make_policy("constant:1"), options).final_cost
+        for options in (PLAIN, MOVES_ONLY)
+    )
     assert moved - lowest < 0.5 * (plain - lowest)
     for layout, before in wide():
         bare, followed = (step(layout, before, 1e-2, options)[1] for options in (PLAIN, MOVES_ONLY))

@@ -1,4 +1,5 @@
-"""Points from the rays of their pixels: the nearest point to all rays, and a start that is never worse."""
+"""Points from the rays of their pixels: the nearest point to all rays, and a start that is never
+worse."""
 
 from __future__ import annotations
 
@@ -38,7 +39,10 @@ def _refined(layout, cameras, before, start):
     """Points and costs, stacked."""
     frames, previous = _there(layout, cameras, before)
     return jnp.concatenate(
-        [(found := refine_points(layout, cameras, frames, start, LOSS, 3, previous))[0], found[1][None]]
+        [
+            (found := refine_points(layout, cameras, frames, start, LOSS, 3, previous))[0],
+            found[1][None],
+        ]
     )
 
 
@@ -61,7 +65,9 @@ def order_of(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
 
 def in_layout(problem: BundleProblem, points: np.ndarray) -> np.ndarray:
     """Points in layout order."""
-    return np.asarray(initial_state(build_layout(problem), problem.replace(points=points), StepOptions()).points)
+    return np.asarray(
+        initial_state(build_layout(problem), problem.replace(points=points), StepOptions()).points
+    )
 
 
 def nearest_to_rays(problem: BundleProblem, point: int) -> np.ndarray:
@@ -72,7 +78,11 @@ def nearest_to_rays(problem: BundleProblem, point: int) -> np.ndarray:
         pixel = np.asarray(problem.observations)[k]
         f, k1, k2 = camera[6:]
         size = np.linalg.norm(pixel)
-        radius = brentq(lambda r, s=size, f=f, a=k1, b=k2: f * r * (1 + a * r**2 + b * r**4) - s, 0, 2 * size / f)
+        radius = brentq(
+            lambda r, s=size, f=f, a=k1, b=k2: f * r * (1 + a * r**2 + b * r**4) - s,
+            0,
+            2 * size / f,
+        )
         turn = geometry.rotation_matrices(camera[None, :3])[0]
         ray = turn.T @ np.array([*(radius * pixel / size), -1])
         ray /= np.linalg.norm(ray)
@@ -107,7 +117,9 @@ def point_costs(problem: BundleProblem) -> np.ndarray:
     return np.bincount(problem.point_index, 0.5 * squared, minlength=problem.num_points)
 
 
-@pytest.mark.parametrize("make", [lambda: thrown(2, 3.0), lambda: strayed(-1.0), lambda: strayed(1e4)])
+@pytest.mark.parametrize(
+    "make", [lambda: thrown(2, 3.0), lambda: strayed(-1.0), lambda: strayed(1e4)]
+)
 def test_a_start_costs_no_more_than_where_the_step_went_and_is_behind_no_camera(make):
     home, gone = solved(), make()
     layout, cameras = build_layout(home), np.asarray(home.cameras).T
@@ -127,7 +139,8 @@ def test_a_start_costs_no_more_than_where_the_step_went_and_is_behind_no_camera(
 
 
 def test_where_the_step_was_right_nothing_is_moved():
-    """At the minimum a point fits better than the midpoint of its rays, which minimises something else."""
+    """At the minimum a point fits better than the midpoint of its rays, which minimises something
+    else."""
     problem = solved()
     own = in_layout(problem, problem.points)
     found = _starts(build_layout(problem), np.asarray(problem.cameras).T, own, own, LOSS)
@@ -147,14 +160,20 @@ def wrong(seed: int, size: float) -> tuple[BundleProblem, np.ndarray]:
 
 
 @pytest.mark.parametrize(("seed", "size"), [(0, 0.3), (1, 0.3), (2, 3.0)])
-def test_from_both_starts_a_point_ends_at_the_cheaper_end_and_from_one_at_that_of_the_likely_one(seed, size):
+def test_from_both_starts_a_point_ends_at_the_cheaper_end_and_from_one_at_that_of_the_likely_one(
+    seed, size
+):
     """Against `refine_points` from each of them.
 
-    Two programs round differently. By costs that agree to rounding a minimum is known to the root of it alone: both
-    starts may end there, 1e-8 apart. Other minima are 1e-2 away and more.
-    """
+    Two programs round differently. By costs that agree to rounding a minimum is known to the root
+    of it alone: both starts may end there, 1e-8 apart. Other minima are 1e-2 away and more."""
     home, points = wrong(seed, size)
-    args = build_layout(home), np.asarray(home.cameras).T, in_layout(home, home.points), in_layout(home, points)
+    args = (
+        build_layout(home),
+        np.asarray(home.cameras).T,
+        in_layout(home, home.points),
+        in_layout(home, points),
+    )
     apart = [np.asarray(_refined(*args[:3], start)) for start in _starts(*args, LOSS)]
     none, one, both = (np.asarray(_from_starts(*args, jnp.asarray(starts))) for starts in range(3))
 
@@ -175,7 +194,10 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     home, points = wrong(2, 3.0)
     problem = home.replace(points=points)
     args = build_layout(home), np.asarray(home.cameras).T, *[in_layout(home, points)] * 2
-    options, damping = StepOptions(refinement=Refinement(points=3, starts="rays")), jnp.asarray(1e12)
+    options, damping = (
+        StepOptions(refinement=Refinement(points=3, starts="rays")),
+        jnp.asarray(1e12),
+    )
     costs = {}
     for limit, both in ((acceptance.NEAR_CONVERGENCE, True), (0.0, False)):
         monkeypatch.setattr(acceptance, "NEAR_CONVERGENCE", limit)
@@ -189,14 +211,19 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
 
 @pytest.mark.slow
 def test_only_the_whole_step_asks_for_the_rays():
-    """Points far away: they start from their rays where the step is whole, not where it is tried again shorter."""
+    """Points far away: they start from their rays where the step is whole, not where it is tried
+    again shorter."""
     start = strayed(1e4)
     layout = build_layout(start)
     state = initial_state(layout, start, StepOptions())
     damping, costs = jnp.asarray(1.0), {}
     for trials in (1, 2):
         options = StepOptions(refinement=Refinement(points=3, starts="rays", trials=trials))
-        once = jax.jit(lambda layout, state, options=options: lm_step(layout, state, damping, options, jnp.inf)[1])
+        once = jax.jit(
+            lambda layout, state, options=options: lm_step(
+                layout, state, damping, options, jnp.inf
+            )[1]
+        )
         info = once(layout, state)
         assert not info.accepted
         costs[trials] = float(info.candidate_cost)

@@ -1,7 +1,8 @@
-"""Embedded point iterations: every point by itself, never worse than before, and at the end where SciPy ends.
+"""Embedded point iterations: every point by itself, never worse than before, and at the end where
+SciPy ends.
 
-A step with a lambda of 1e30 moves no camera and no point by itself, so that all that it does is the refinement.
-"""
+A step with a lambda of 1e30 moves no camera and no point by itself, so that all that it does is the
+refinement."""
 
 from __future__ import annotations
 
@@ -20,7 +21,12 @@ from jaxba import BundleProblem, Loss, StepOptions, read_bal
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
-from jaxba.refinement.points import MAX_DISTANCE_RATIO, SMALL_DECREASE, PreviousPoints, refine_points
+from jaxba.refinement.points import (
+    MAX_DISTANCE_RATIO,
+    SMALL_DECREASE,
+    PreviousPoints,
+    refine_points,
+)
 
 pytestmark = pytest.mark.step
 
@@ -80,15 +86,22 @@ def test_points_take_no_further_step_after_one_that_brought_no_more_than_enough(
             layout, state.cameras, frames, points, loss, iterations, None, enough
         )
     )
-    total = lambda iterations, enough=-np.inf: float(np.sum(refine(state.points, iterations, enough)[1]))
+    total = lambda iterations, enough=-np.inf: float(
+        np.sum(refine(state.points, iterations, enough)[1])
+    )
     totals = [total(k) for k in range(5)]
     brought = -np.diff(totals)
     assert (brought[:3] > 0).all()
     assert (np.diff(brought[:3]) < 0).all()
     for enough in (*brought[:3] * (1 + 1e-6), *brought[:3] * (1 - 1e-6), 1e300):
-        last = next(k for k in range(4) if brought[k] <= min(enough, SMALL_DECREASE * totals[k + 1]) or k == 3)
+        last = next(
+            k
+            for k in range(4)
+            if brought[k] <= min(enough, SMALL_DECREASE * totals[k + 1]) or k == 3
+        )
         np.testing.assert_allclose(total(4, enough), totals[last + 1], rtol=1e-12)
-    assert brought[0] > SMALL_DECREASE * totals[1]  # so that the last of them is not after the first
+    # so that the last of them is not after the first
+    assert brought[0] > SMALL_DECREASE * totals[1]
 
 
 def test_cameras_are_not_touched():
@@ -112,11 +125,17 @@ def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
             if loss.trivial:
                 return r.ravel()
             squared = np.sum(r**2, axis=1)
-            # the same direction with the length sqrt(rho), so that the sum of squares is the sum of rho
-            return (r * np.sqrt(published_loss(loss.rho, loss.scale, squared)[0] / squared)[:, None]).ravel()
+            # the same direction with the length sqrt(rho), so that the sum of squares is the sum of
+            # rho
+            return (
+                r * np.sqrt(published_loss(loss.rho, loss.scale, squared)[0] / squared)[:, None]
+            ).ravel()
 
-        best = least_squares(residuals, problem.points[point], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        # SciPy's derivatives, by differences, are off by 1e-8, and by that times its conditioning a point's end
+        best = least_squares(
+            residuals, problem.points[point], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
+        # SciPy's derivatives, by differences, are off by 1e-8, and by that times its conditioning a
+        # point's end
         np.testing.assert_allclose(found.points[point], best.x, rtol=1e-5, atol=2e-5)
         np.testing.assert_allclose(point_costs(found, loss)[point], best.cost, rtol=1e-9)
 
@@ -128,13 +147,15 @@ def test_refinement_never_makes_the_candidate_of_a_step_worse(damping):
         layout, before = start(thrown(seed, size))
         plain = step(layout, before, damping, StepOptions())[1]
         with_points = step(layout, before, damping, StepOptions(refinement=Refinement(points=3)))[1]
-        # two programs; without damping a direction that hardly costs anything is known to few digits
+        # two programs; without damping a direction that hardly costs anything is known to few
+        # digits
         assert not with_points.candidate_cost > plain.candidate_cost * (1 + 1e-8)
         np.testing.assert_allclose(with_points.predicted, plain.predicted, rtol=1e-8)
 
 
 def test_a_bold_step_that_fails_alone_is_saved_by_its_points():
-    """Points thrown far, next to no damping: the plain step must be rejected, the refined one is taken."""
+    """Points thrown far, next to no damping: the plain step must be rejected, the refined one is
+    taken."""
     problem = thrown(0, 2.0)
     layout, before = start(problem)
     after, plain = step(layout, before, 1e-8, StepOptions())
@@ -151,7 +172,11 @@ def test_points_whose_rays_are_parallel_stay_finite():
     camera = [0.1, 0.2, -0.1, 0.3, 0.1, -5.0, 700.0, 0.0, 0.0]
     points = rng.normal(size=(6, 3))
     problem = BundleProblem.create(
-        [camera, camera], points, rng.normal(scale=80, size=(12, 2)), np.tile([0, 1], 6), np.repeat(np.arange(6), 2)
+        [camera, camera],
+        points,
+        rng.normal(scale=80, size=(12, 2)),
+        np.tile([0, 1], 6),
+        np.repeat(np.arange(6), 2),
     )
     options = StepOptions(refinement=Refinement(points=3))
     layout, before = start(problem, options)
@@ -165,7 +190,8 @@ def test_points_whose_rays_are_parallel_stay_finite():
 
 
 def depths(problem: BundleProblem) -> np.ndarray:
-    """Distance along the viewing direction of every observation; negative behind the camera, which looks down -z."""
+    """Distance along the viewing direction of every observation; negative behind the camera, which
+    looks down -z."""
     turn = Rotation.from_rotvec(np.asarray(problem.cameras)[problem.camera_index, :3])
     local = turn.apply(np.asarray(problem.points)[problem.point_index])
     return -(local + np.asarray(problem.cameras)[problem.camera_index, 3:6])[:, 2]
@@ -175,7 +201,9 @@ def mirrored(problem: BundleProblem, which: np.ndarray) -> BundleProblem:
     """Points put where their first camera sees them at the same pixel, but behind it."""
     points = np.array(problem.points)
     for point in which:
-        camera = problem.cameras[problem.camera_index[np.flatnonzero(problem.point_index == point)[0]]]
+        camera = problem.cameras[
+            problem.camera_index[np.flatnonzero(problem.point_index == point)[0]]
+        ]
         centre = -Rotation.from_rotvec(camera[:3]).inv().apply(camera[3:6])
         points[point] = 2 * centre - points[point]
     return problem.replace(points=points)
@@ -184,7 +212,9 @@ def mirrored(problem: BundleProblem, which: np.ndarray) -> BundleProblem:
 @functools.partial(jax.jit, static_argnames=("loss", "iterations"))
 def _refined_after(layout, state, points, loss, iterations):
     """Points that a step took from those of the state to `points`, after point iterations."""
-    previous = PreviousPoints.of(layout, state.points, linearize(layout, state.cameras, state.points, loss).reference)
+    previous = PreviousPoints.of(
+        layout, state.points, linearize(layout, state.cameras, state.points, loss).reference
+    )
     frames = slot_frames(layout, state.cameras)
     return refine_points(layout, state.cameras, frames, points, loss, iterations, previous)
 
@@ -227,8 +257,8 @@ def nearness(problem: BundleProblem) -> np.ndarray:
 
 
 def parallel(seed: int) -> BundleProblem:
-    """Points in pictures from two cameras a hundredth of their distance apart, noisy enough that half of the rays meet
-    nowhere: the cheapest places are at infinity and beyond."""
+    """Points in pictures from two cameras a hundredth of their distance apart, noisy enough that
+    half of the rays meet nowhere: the cheapest places are at infinity and beyond."""
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(-2, 2, (60, 2)), rng.uniform(-12, -8, 60)])
     cameras = [[0, 0, 0, shift, 0, 0, 500.0, 0, 0] for shift in (0.0, 0.1)]
@@ -280,7 +310,9 @@ def test_points_that_the_step_brought_from_behind_to_the_front_stay_there():
 def test_a_point_that_the_step_took_far_away_starts_again_from_previous():
     problem = support.tiny()
     layout, state = start(problem)
-    centre = np.mean([-Rotation.from_rotvec(c[:3]).inv().apply(c[3:6]) for c in problem.cameras], axis=0)
+    centre = np.mean(
+        [-Rotation.from_rotvec(c[:3]).inv().apply(c[3:6]) for c in problem.cameras], axis=0
+    )
     at_previous, _ = _refined_after(layout, state, state.points, Loss(), 1)
     real = [(point == problem.points).all(axis=1).any() for point in np.asarray(state.points).T]
     for times, came_back in ((3e3, True), (3.0, False)):
@@ -295,7 +327,8 @@ def test_a_point_that_the_step_took_far_away_starts_again_from_previous():
 @needs_data
 @pytest.mark.slow
 def test_points_of_a_street_stay_in_front_of_their_cameras():
-    """kittistereo00s: without a previous place to return to, it ended at 2952 with 61 observations behind."""
+    """kittistereo00s: without a previous place to return to, it ended at 2952 with 61 observations
+    behind."""
     folder = bal_file("x").parent.parent / "bal-converted"
     problem = read_bal(folder / "kittistereo00s-77-15638-pre.txt.bz2")
     solution = solve(problem, "bold")

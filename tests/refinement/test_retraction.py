@@ -1,4 +1,5 @@
-"""How a step is added to the cameras: the same to first order in all coordinates, and along a zoom exact."""
+"""How a step is added to the cameras: the same to first order in all coordinates, and along a zoom
+exact."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ _move = jax.jit(move_cameras, static_argnames=("options",))
 
 
 def random_step(seed: int, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cameras of `tiny` with distortion, and a step, both as [9, cameras]; focal lengths change by `size` at most."""
+    """Cameras of `tiny` with distortion, and a step, both as [9, cameras]; focal lengths change by
+    `size` at most."""
     rng = np.random.default_rng(seed)
     cameras = np.array(support.tiny().cameras).T
     cameras[7:] = rng.normal(size=cameras[7:].shape) * [[0.1], [0.05]]
@@ -39,7 +41,9 @@ def test_all_lens_steps_agree_to_first_order(rotation):
     first = []
     for lens_step in ("file", "pixels"):
         options = StepOptions(coordinates=Coordinates(rotation=rotation, lens_step=lens_step))
-        along = lambda size, options=options: move_cameras(layout, jnp.asarray(cameras), size * step, options)
+        along = lambda size, options=options: move_cameras(
+            layout, jnp.asarray(cameras), size * step, options
+        )
         first.append(jax.jvp(along, (0.0,), (1.0,)))
     (start, slope), (other_start, other_slope) = first
     np.testing.assert_allclose(other_slope, slope, rtol=1e-12, atol=1e-12)
@@ -55,7 +59,8 @@ def test_all_lens_steps_agree_to_first_order(rotation):
 @pytest.mark.parametrize("lens_step", ["file", "pixels"])
 def test_the_step_between_two_places_is_the_one_that_was_made_to_first_order(rotation, lens_step):
     cameras, step = random_step(3, 1e-5)
-    cameras[:3] = np.random.default_rng(4).normal(size=cameras[:3].shape)  # turned by a radian or two
+    # turned by a radian or two
+    cameras[:3] = np.random.default_rng(4).normal(size=cameras[:3].shape)
     options = StepOptions(coordinates=Coordinates(rotation=rotation, lens_step=lens_step))
     moved = _move(build_layout(support.tiny()), cameras, step, options)
     found = step_between(jnp.asarray(cameras), moved, options)
@@ -64,12 +69,15 @@ def test_the_step_between_two_places_is_the_one_that_was_made_to_first_order(rot
 
 @pytest.mark.parametrize("growth", [0.25, -0.25])
 def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
-    """Focal length and all depths grow alike; the first-order change of k1 and k2 is what a linear model proposes."""
+    """Focal length and all depths grow alike; the first-order change of k1 and k2 is what a linear
+    model proposes."""
     rng = np.random.default_rng(1)
     local = np.column_stack([rng.normal(size=(20, 2)), -rng.uniform(2, 9, size=20)])
     turn = Rotation.from_rotvec([0.3, -0.2, 0.9])
     camera = np.array([*turn.as_rotvec(), 0.1, 0.2, 0.3, 500.0, 0.15, -0.08])
-    seen = lambda camera, local: support.distort(-local[:, :2] / local[:, 2:], np.tile(camera[6:], (20, 1)))
+    seen = lambda camera, local: support.distort(
+        -local[:, :2] / local[:, 2:], np.tile(camera[6:], (20, 1))
+    )
     step = np.zeros((9, 1))
     step[6:, 0] = camera[6] * growth, 2 * camera[7] * growth, 4 * camera[8] * growth
     points = turn.inv().apply(local - camera[3:6])
@@ -82,7 +90,12 @@ def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
     )
     after = {
         how: np.asarray(
-            _move(build_layout(problem), camera[:, None], step, StepOptions(coordinates=Coordinates(lens_step=how)))
+            _move(
+                build_layout(problem),
+                camera[:, None],
+                step,
+                StepOptions(coordinates=Coordinates(lens_step=how)),
+            )
         )[:, 0]
         for how in ("file", "pixels")
     }
@@ -95,7 +108,10 @@ def test_far_from_where_it_is_linear_a_lens_is_added_as_it_is():
     cameras, step = random_step(2, 0.1)
     near, far = 0.9 * MAX_FOCAL_CHANGE, 1.1 * MAX_FOCAL_CHANGE
     step[6] = cameras[6] * np.array([near, -near, far, -far, 50.0, -2.0])
-    moved, plain = (np.asarray(_move(build_layout(support.tiny()), cameras, step, how)) for how in (PIXELS, FILE))
+    moved, plain = (
+        np.asarray(_move(build_layout(support.tiny()), cameras, step, how))
+        for how in (PIXELS, FILE)
+    )
     assert (moved[7:, :2] != plain[7:, :2]).all()
     chex.assert_trees_all_equal(moved[:, 2:], plain[:, 2:], strict=True)
     chex.assert_trees_all_equal(moved[:7], plain[:7], strict=True)
@@ -104,7 +120,10 @@ def test_far_from_where_it_is_linear_a_lens_is_added_as_it_is():
 def test_a_camera_without_focal_length_stays_finite():
     cameras, step = random_step(3, 0.1)
     cameras[6, 0] = 0
-    moved, plain = (np.asarray(_move(build_layout(support.tiny()), cameras, step, how)) for how in (PIXELS, FILE))
+    moved, plain = (
+        np.asarray(_move(build_layout(support.tiny()), cameras, step, how))
+        for how in (PIXELS, FILE)
+    )
     assert np.isfinite(moved).all()
     chex.assert_trees_all_equal(moved[:, 0], plain[:, 0], strict=True)
 
@@ -123,7 +142,9 @@ def test_what_of_a_lens_stays_is_not_touched_by_a_zoom():
         assert (moved[row, free] != (cameras + step)[row, free]).all()
     fixed = StepOptions(intrinsics="fixed", coordinates=Coordinates(lens_step="pixels"))
     step[6:] = 0
-    chex.assert_trees_all_equal(np.asarray(_move(layout, cameras, step, fixed))[6:], cameras[6:], strict=True)
+    chex.assert_trees_all_equal(
+        np.asarray(_move(layout, cameras, step, fixed))[6:], cameras[6:], strict=True
+    )
 
 
 @pytest.mark.slow
@@ -132,7 +153,9 @@ def test_shared_lenses_stay_equal_bit_by_bit():
     cameras = np.array(problem.cameras)
     cameras[:, 6:] = cameras[0, 6], 0.05, -0.01
     lenses = Lenses(np.zeros(problem.num_cameras, int), np.ones((1, 3), bool))
-    found = solve(problem.replace(cameras=cameras, lenses=lenses), "ceres", PIXELS, max_iterations=8)
+    found = solve(
+        problem.replace(cameras=cameras, lenses=lenses), "ceres", PIXELS, max_iterations=8
+    )
     lens = np.asarray(found.problem.cameras)[:, 6:]
     assert same_bits(lens, np.tile(lens[:1], (len(lens), 1)))
     assert (lens[0] != cameras[0, 6:]).all()
@@ -143,4 +166,6 @@ def test_without_a_change_of_focal_length_nothing_differs():
     cameras, step = random_step(5, 0.1)
     step[6] = 0
     layout = build_layout(support.tiny())
-    chex.assert_trees_all_equal(_move(layout, cameras, step, PIXELS), _move(layout, cameras, step, FILE), strict=True)
+    chex.assert_trees_all_equal(
+        _move(layout, cameras, step, PIXELS), _move(layout, cameras, step, FILE), strict=True
+    )

@@ -1,4 +1,5 @@
-"""Keys of the file of `--constraints` for what was measured: rows of residuals, notes and errors of one line."""
+"""Keys of the file of `--constraints` for what was measured: rows of residuals, notes and errors of
+one line."""
 
 from __future__ import annotations
 
@@ -42,20 +43,29 @@ def said(tmp_path, problem):
 def data(problem: jaxba.BundleProblem) -> tuple[list[list[int]], dict[str, np.ndarray]]:
     """Indices and data of the only rows."""
     (rows,) = problem.residuals.rows
-    return [x.tolist() for x in rows.index], dict(zip(rows.residual.data, map(np.asarray, rows.data), strict=True))
+    return [x.tolist() for x in rows.index], dict(
+        zip(rows.residual.data, map(np.asarray, rows.data), strict=True)
+    )
 
 
 def test_control_points_are_rows_of_points_by_id(said):
     places, stddev = "{103: [1, 2, 3], 7: [0, 0, 0], 129: [4, 5, 6]}", "[0.5, 1, [1, 2, 4]]"
     text = f"control_points: {{positions: {places}, stddev: {stddev}, loss: huber}}\n"
-    with pytest.warns(ProblemWarning, match=r"c.yaml: control_points: left out positions of 1 point that .*: 7"):
+    with pytest.warns(
+        ProblemWarning, match=r"c.yaml: control_points: left out positions of 1 point that .*: 7"
+    ):
         found = said(text)
     index, of = data(found)
     assert index == [[3, 29]]
     assert of["position"].tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert of["whitening"].tolist() == [np.diag([2.0] * 3).tolist(), np.diag([1, 0.5, 0.25]).tolist()]
+    assert of["whitening"].tolist() == [
+        np.diag([2.0] * 3).tolist(),
+        np.diag([1, 0.5, 0.25]).tolist(),
+    ]
     assert found.residuals.rows[0].loss == jaxba.Loss("huber")
-    with pytest.raises(UsageError, match="control_points: positions of 1 point that the problem does not have: 7"):
+    with pytest.raises(
+        UsageError, match="control_points: positions of 1 point that the problem does not have: 7"
+    ):
         said(text, strict=True)
 
 
@@ -69,7 +79,10 @@ def test_a_scale_bar_scales_a_scene_that_has_no_scale(said):
 
 
 def test_directions_of_gravity_are_rows_of_images_by_name_or_id(said):
-    found = said("gravity: {up: [0, 1, 0], directions: {view1.jpg: [0, -1, 0], 3: [0, -9, 1]}, stddev: 0.02}\n")
+    found = said(
+        "gravity: {up: [0, 1, 0], directions: {view1.jpg: [0, -1, 0], 3: [0, -9, 1]}, stddev: "
+        "0.02}\n"
+    )
     index, of = data(found)
     assert index == [[1, 2]]
     assert of["direction"].tolist() == [[0, -1, 0], [0, -9, 1]]
@@ -85,7 +98,9 @@ def test_relative_poses_have_quaternions_or_angle_axis_vectors(said):
     other = "translation: [0, 0, 1], stddev: [1, 1], rotation: [0.1, -0.2, 0.3]"
     pairs = {"[view0.jpg, 3]": item, "[1, gone.jpg]": other, "[4, view1.jpg]": other}
     text = "".join(f"- {{images: {pair}, {numbers}}}\n" for pair, numbers in pairs.items())
-    with pytest.warns(ProblemWarning, match="relative_poses: left out pairs of 1 image that .* have: gone.jpg"):
+    with pytest.warns(
+        ProblemWarning, match="relative_poses: left out pairs of 1 image that .* have: gone.jpg"
+    ):
         index, of = data(said(f"relative_poses:\n{text}"))
     assert index == [[0, 3], [2, 1]]
     np.testing.assert_allclose(of["rotation"], [turn.as_matrix()] * 2, atol=1e-12)
@@ -94,12 +109,15 @@ def test_relative_poses_have_quaternions_or_angle_axis_vectors(said):
 
 @pytest.mark.parametrize("model", ["BAL", "SIMPLE_PINHOLE"])
 def test_depth_maps_are_looked_up_at_pixels_and_find_their_scales(model, problem, tmp_path):
-    """Maps with twice the depth and a half; one image has none, and one pixel of another has no depth."""
+    """Maps with twice the depth and a half; one image has none, and one pixel of another has no
+    depth."""
     width, height, scale, shift = 900, 700, 2.0, 0.5
     if model == "SIMPLE_PINHOLE":
         cameras = np.hstack([problem.cameras[:, :7], np.tile([width / 2, height / 2], (5, 1))])
         kinds, free = (CAMERA_MODELS[model],), np.zeros((5, 3), bool)
-        problem = problem.replace(cameras=cameras, lenses=jaxba.Lenses(np.arange(5, dtype=np.int32), free, None, kinds))
+        problem = problem.replace(
+            cameras=cameras, lenses=jaxba.Lenses(np.arange(5, dtype=np.int32), free, None, kinds)
+        )
     else:
         problem = problem.replace(cameras=problem.cameras * ([1.0] * 7 + [0, 0]))
     problem = problem.replace(observations=geometry.project(problem))
@@ -121,7 +139,11 @@ def test_depth_maps_are_looked_up_at_pixels_and_find_their_scales(model, problem
     assert len(index[0]) == np.sum(inside & (problem.camera_index < 4)) - 1
     assert index[0] == index[2]
     ahead = dict(
-        zip(zip(problem.camera_index, problem.point_index, strict=True), geometry.depths(problem), strict=True)
+        zip(
+            zip(problem.camera_index, problem.point_index, strict=True),
+            geometry.depths(problem),
+            strict=True,
+        )
     )
     truth = [scale * ahead[pair] + shift for pair in zip(index[0], index[1], strict=True)]
     np.testing.assert_allclose(of["measured"], truth)
@@ -161,47 +183,91 @@ def test_depth_maps_are_looked_up_from_the_principal_points_of_a_model(problem, 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("control_points: 5", "control_points: must be a mapping with the keys positions, stddev, loss"),
-        ("control_points: {positions: {103: [1, 2]}}", "positions: 103: must be three numbers, not [1, 2]"),
-        ("control_points: {positions: {103: [1, 2, 3]}, align: true}", "control_points: unknown key align; there are"),
-        ("control_points: {positions: {7: [1, 2, 3]}}", "control_points: none of the points is in the problem: 7"),
-        ("control_points: {positions: {103: [1, 2, 3]}, stddev: [1, 2]}", "three for each of 1 points, not 2 values"),
-        ("gravity: {directions: {1: [0, 1, 0]}}", "gravity: 'up' is missing"),
-        ("gravity: {up: 1, directions: {1: [0, 1, 0]}}", "gravity: up: must be three numbers, not 1"),
-        ("gravity: {up: [0, 0, 1], directions: [1]}", "directions: must be a mapping from images to [x, y, z]"),
-        ("distances: {points: [100, 101]}", "distances: must be a list of mappings, not {points: [100, 101]}"),
-        ("distances: [{points: [100, 101], length: 1}]", "distances: 'stddev' is missing"),
-        ("distances: [{points: [100, 100], length: 1, stddev: 1}]", "points: must be two, not [100, 100]"),
-        ("distances: [{points: [100, 101], length: 1, stddev: 0}]", "100, 101: stddev: must be positive, not 0"),
-        ("distances: [{points: [100, 101], length: -1, stddev: 1}]", "100, 101: length: must be positive, not -1"),
         (
-            "relative_poses: [{images: [view0.jpg, 1], rotation: [0, 0, 0], translation: [0, 0, 0], stddev: [1, 1]}]",
+            "control_points: 5",
+            "control_points: must be a mapping with the keys positions, stddev, loss",
+        ),
+        (
+            "control_points: {positions: {103: [1, 2]}}",
+            "positions: 103: must be three numbers, not [1, 2]",
+        ),
+        (
+            "control_points: {positions: {103: [1, 2, 3]}, align: true}",
+            "control_points: unknown key align; there are",
+        ),
+        (
+            "control_points: {positions: {7: [1, 2, 3]}}",
+            "control_points: none of the points is in the problem: 7",
+        ),
+        (
+            "control_points: {positions: {103: [1, 2, 3]}, stddev: [1, 2]}",
+            "three for each of 1 points, not 2 values",
+        ),
+        ("gravity: {directions: {1: [0, 1, 0]}}", "gravity: 'up' is missing"),
+        (
+            "gravity: {up: 1, directions: {1: [0, 1, 0]}}",
+            "gravity: up: must be three numbers, not 1",
+        ),
+        (
+            "gravity: {up: [0, 0, 1], directions: [1]}",
+            "directions: must be a mapping from images to [x, y, z]",
+        ),
+        (
+            "distances: {points: [100, 101]}",
+            "distances: must be a list of mappings, not {points: [100, 101]}",
+        ),
+        ("distances: [{points: [100, 101], length: 1}]", "distances: 'stddev' is missing"),
+        (
+            "distances: [{points: [100, 100], length: 1, stddev: 1}]",
+            "points: must be two, not [100, 100]",
+        ),
+        (
+            "distances: [{points: [100, 101], length: 1, stddev: 0}]",
+            "100, 101: stddev: must be positive, not 0",
+        ),
+        (
+            "distances: [{points: [100, 101], length: -1, stddev: 1}]",
+            "100, 101: length: must be positive, not -1",
+        ),
+        (
+            "relative_poses: [{images: [view0.jpg, 1], rotation: [0, 0, 0], translation: [0, 0, "
+            "0], stddev: [1, 1]}]",
             "relative_poses: a pair has the same image twice",
         ),
         ("depths: {folder: [maps], stddev: 1}", "folder: must be a name, not"),
-        ("distances: [{points: [100, 101], length: x, stddev: 1}]", "100, 101: length: must be a number, not x"),
         (
-            "relative_poses: [{images: [1, 2], rotation: [1, 2], translation: [0, 0, 0], stddev: [1, 1]}]",
+            "distances: [{points: [100, 101], length: x, stddev: 1}]",
+            "100, 101: length: must be a number, not x",
+        ),
+        (
+            "relative_poses: [{images: [1, 2], rotation: [1, 2], translation: [0, 0, 0], stddev: "
+            "[1, 1]}]",
             "relative_poses: 1, 2: rotation: must be 3 numbers or 4 numbers, not [1, 2]",
         ),
         (
-            "relative_poses: [{images: [1, 2], rotation: [0, 0, 0, 0], translation: [0, 0, 0], stddev: [1, 1]}]",
+            "relative_poses: [{images: [1, 2], rotation: [0, 0, 0, 0], translation: [0, 0, 0], "
+            "stddev: [1, 1]}]",
             "relative_poses: 1, 2: rotation: must be a quaternion of length one, not [0, 0, 0, 0]",
         ),
         (
-            "relative_poses: [{images: [1, 2], rotation: [1, 1, 0, 0], translation: [0, 0, 0], stddev: [1, 1]}]",
+            "relative_poses: [{images: [1, 2], rotation: [1, 1, 0, 0], translation: [0, 0, 0], "
+            "stddev: [1, 1]}]",
             "relative_poses: 1, 2: rotation: must be a quaternion of length one, not [1, 1, 0, 0]",
         ),
         (
             "gravity: {up: [0, 0, 1], directions: {1: [0, 1, 0], view1.jpg: [0, 0, 0]}}",
-            "gravity: direction of gravity must be other than zero, not [0.0, 0.0, 0.0] (image 2 (view1.jpg))",
+            "gravity: direction of gravity must be other than zero, not [0.0, 0.0, 0.0] (image 2 "
+            "(view1.jpg))",
         ),
         (
             "gravity: {up: [0, 0, 0], directions: {1: [0, 1, 0]}}",
             "gravity: up of gravity must be other than zero, not [0.0, 0.0, 0.0]",
         ),
         ("depths: {folder: nowhere}", "depths: 'stddev' is missing"),
-        ("depths: {folder: ., stddev: -1}", "depths: stddev: must be a positive number, or three, not -1"),
+        (
+            "depths: {folder: ., stddev: -1}",
+            "depths: stddev: must be a positive number, or three, not -1",
+        ),
         ("depths: {folder: bad, stddev: 1}", "view0.npy: no matrix of depths"),
     ],
 )

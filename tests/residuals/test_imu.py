@@ -1,4 +1,5 @@
-"""Preintegrated measurements of an IMU against fine integration, and a solve that finds motion and biases."""
+"""Preintegrated measurements of an IMU against fine integration, and a solve that finds motion and
+biases."""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ MOMENTS = np.linspace(0.1003, 1.3003, 5)  # between samples
 
 def attitude(t) -> Rotation:
     """From the IMU to the world."""
-    return Rotation.from_rotvec(np.stack([0.5 * np.sin(2 * t), 0.4 * t, 0.3 * np.cos(3 * t)], axis=-1))
+    return Rotation.from_rotvec(
+        np.stack([0.5 * np.sin(2 * t), 0.4 * t, 0.3 * np.cos(3 * t)], axis=-1)
+    )
 
 
 def place(t) -> np.ndarray:
@@ -48,9 +51,18 @@ def test_an_interval_is_that_of_fine_integration():
         now = lambda x: np.array([np.interp(time, t, column) for column in x.T])
         rotation = state[:9].reshape(3, 3)
         turn = np.cross(np.eye(3), now(rates) - BIAS[:3])
-        return np.concatenate([(rotation @ turn).ravel(), rotation @ (now(forces) - BIAS[3:]), state[9:12]])
+        return np.concatenate(
+            [(rotation @ turn).ravel(), rotation @ (now(forces) - BIAS[3:]), state[9:12]]
+        )
 
-    whole = solve_ivp(rate, (start, end), np.r_[np.eye(3).ravel(), np.zeros(6)], rtol=1e-9, atol=1e-11, max_step=0.002)
+    whole = solve_ivp(
+        rate,
+        (start, end),
+        np.r_[np.eye(3).ravel(), np.zeros(6)],
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=0.002,
+    )
     truth = whole.y[:, -1]
     np.testing.assert_allclose(found["rotation"][1], truth[:9].reshape(3, 3), atol=3e-6)
     np.testing.assert_allclose(found["velocity"][1], truth[9:12], atol=3e-5)
@@ -66,8 +78,13 @@ def test_derivatives_by_the_biases_are_those_of_differences():
         one, other = (at(BIAS + sign * step * np.eye(6)[k]) for sign in (1, -1))
         turn = Rotation.from_matrix(here["rotation"]).inv()
         turns = [(turn * Rotation.from_matrix(x["rotation"])).as_rotvec() for x in (one, other)]
-        numbers = [np.hstack([w, x["velocity"], x["position"]]) for w, x in zip(turns, (one, other), strict=True)]
-        np.testing.assert_allclose(here["by_bias"][:, :, k], (numbers[0] - numbers[1]) / (2 * step), atol=1e-7)
+        numbers = [
+            np.hstack([w, x["velocity"], x["position"]])
+            for w, x in zip(turns, (one, other), strict=True)
+        ]
+        np.testing.assert_allclose(
+            here["by_bias"][:, :, k], (numbers[0] - numbers[1]) / (2 * step), atol=1e-7
+        )
 
 
 def test_the_covariance_is_that_of_the_recursion_of_the_paper():
@@ -80,7 +97,10 @@ def test_the_covariance_is_that_of_the_recursion_of_the_paper():
         turn = Rotation.from_rotvec(rate * dt).as_matrix()
         a, b = np.eye(9), np.zeros((9, 6))
         a[:3, :3], a[6:, 3:6] = turn.T, np.eye(3) * dt
-        a[3:6, :3], a[6:, :3] = -rotation @ cross(force) * dt, -0.5 * rotation @ cross(force) * dt**2
+        a[3:6, :3], a[6:, :3] = (
+            -rotation @ cross(force) * dt,
+            -0.5 * rotation @ cross(force) * dt**2,
+        )
         b[:3, :3], b[3:6, 3:], b[6:, 3:] = np.eye(3) * dt, rotation * dt, 0.5 * rotation * dt**2
         covariance = a @ covariance @ a.T + b @ np.diag(np.repeat([1e-6, 1e-4], 3) / dt) @ b.T
         rotation = rotation @ turn
@@ -105,14 +125,24 @@ def test_a_solve_finds_poses_velocities_and_biases():
     truth = jaxba.BundleProblem.create(cameras, points, np.zeros((200, 2)), camera, point)
     truth = truth.replace(observations=geometry.project(truth))
     t, rates, forces = samples(500.0)
-    given = residuals.preintegrated(t, rates + BIAS[:3], forces + BIAS[3:], MOMENTS, bias=BIAS + 1e-3, noise=NOISE)
+    given = residuals.preintegrated(
+        t, rates + BIAS[:3], forces + BIAS[3:], MOMENTS, bias=BIAS + 1e-3, noise=NOISE
+    )
     one, two = np.arange(4), np.arange(1, 5)
     rows = residuals.imu(
-        pose=one, motion=one, pose_2=two, motion_2=two, **given, gravity=GRAVITY[None], mount=MOUNT[None]
+        pose=one,
+        motion=one,
+        pose_2=two,
+        motion_2=two,
+        **given,
+        gravity=GRAVITY[None],
+        mount=MOUNT[None],
     )
     moved = truth.cameras.copy()
     moved[1:, :6] += 0.01 * rng.standard_normal((4, 6))
-    start = truth.replace(cameras=moved, points=1.05 * points + 0.01 * rng.standard_normal(points.shape))
+    start = truth.replace(
+        cameras=moved, points=1.05 * points + 0.01 * rng.standard_normal(points.shape)
+    )
     start = jaxba.hold(start, poses=[0], numbers=["focal", "distortion"])
     problem = jaxba.with_residual(start, rows, unknowns={"motion": np.zeros((5, 9))})
     solution = jaxba.solve(problem, "ceres", jaxba.SolveOptions(max_iterations=100))
@@ -131,7 +161,8 @@ def known_motion(motion, *, value, sigma):
 
 @pytest.mark.slow
 def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iterations():
-    """Exact samples of a body on a spiral, priors at both ends, and starts off by 0.1 radians and a metre.
+    """Exact samples of a body on a spiral, priors at both ends, and starts off by 0.1 radians and a
+    metre.
 
     It is the situation of GTSAM's ImuFactorExample, which takes 5 iterations."""
     rng = np.random.default_rng(0)
@@ -145,7 +176,11 @@ def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iter
     angle = np.linalg.norm(spin) * t[:, None]
     across = np.cross(axis, speed) / np.linalg.norm(spin)
     along = axis * (axis @ speed)
-    places = along * t[:, None] + np.sin(angle) * (speed - along) / np.linalg.norm(spin) + (1 - np.cos(angle)) * across
+    places = (
+        along * t[:, None]
+        + np.sin(angle) * (speed - along) / np.linalg.norm(spin)
+        + (1 - np.cos(angle)) * across
+    )
     states = np.arange(seconds + 1) * rate
     ends = [0, seconds]
 
@@ -153,11 +188,17 @@ def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iter
     rotation = geometry.COLMAP_FLIP[:, None] * moved.inv().as_matrix()
     centers = places[states] + rng.standard_normal((len(states), 3))
     lens = np.tile([1.0, 0.0, 0.0], (len(states), 1))
-    cameras = np.hstack([geometry.angle_axis(rotation), geometry.translations(rotation, centers), lens])
+    cameras = np.hstack(
+        [geometry.angle_axis(rotation), geometry.translations(rotation, centers), lens]
+    )
     velocities = turns[states].apply(speed)
-    motion = np.hstack([velocities + 0.1 * rng.standard_normal(velocities.shape), np.zeros((len(states), 6))])
+    motion = np.hstack(
+        [velocities + 0.1 * rng.standard_normal(velocities.shape), np.zeros((len(states), 6))]
+    )
 
-    given = residuals.preintegrated(t, np.tile(spin, (len(t), 1)), forces, t[states], noise=[1e-3] * 4)
+    given = residuals.preintegrated(
+        t, np.tile(spin, (len(t), 1)), forces, t[states], noise=[1e-3] * 4
+    )
     first = np.arange(seconds)
     rows = residuals.imu(
         pose=first,
@@ -168,18 +209,26 @@ def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iter
         gravity=GRAVITY[None],
         mount=np.eye(3, 4)[None],
     )
-    problem = jaxba.with_residual(jaxba.BundleProblem.create(cameras), rows, unknowns={"motion": motion})
+    problem = jaxba.with_residual(
+        jaxba.BundleProblem.create(cameras), rows, unknowns={"motion": motion}
+    )
     value = np.hstack([velocities[ends], np.zeros((2, 6))])
     sigma = np.array([0.1] * 3 + [1e-3] * 6)[None]
     problem = jaxba.with_residual(problem, known_motion(motion=ends, value=value, sigma=sigma))
-    problem = jaxba.with_position_priors(problem, places[states][ends], stddev=0.1, images=ends, align=False)
+    problem = jaxba.with_position_priors(
+        problem, places[states][ends], stddev=0.1, images=ends, align=False
+    )
     true = geometry.COLMAP_FLIP[:, None] * turns[states][ends].inv().as_matrix()
-    problem = jaxba.with_rotation_priors(problem, geometry.angle_axis(true), 0.01 * np.eye(3), images=ends)
+    problem = jaxba.with_rotation_priors(
+        problem, geometry.angle_axis(true), 0.01 * np.eye(3), images=ends
+    )
     solution = jaxba.solve(problem)
     assert solution.converged
     assert solution.iterations <= 8
     assert solution.final_cost < 1e-4
-    np.testing.assert_allclose(geometry.camera_centers(solution.problem.cameras), places[states], atol=5e-3)
+    np.testing.assert_allclose(
+        geometry.camera_centers(solution.problem.cameras), places[states], atol=5e-3
+    )
 
 
 def test_wrong_times_are_one_line():

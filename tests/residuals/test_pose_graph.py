@@ -16,15 +16,22 @@ COUNT = 8
 
 
 def graph() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Angle-axis and translation of poses from the world, pairs of them, and their measured relative poses."""
+    """Angle-axis and translation of poses from the world, pairs of them, and their measured
+    relative poses."""
     random = np.random.default_rng(0)
-    poses = np.hstack([0.5 * random.standard_normal((COUNT, 3)), random.standard_normal((COUNT, 3))])
+    poses = np.hstack(
+        [0.5 * random.standard_normal((COUNT, 3)), random.standard_normal((COUNT, 3))]
+    )
     pairs = np.array([(k, (k + step) % COUNT) for step in (1, 3) for k in range(COUNT)])
     turn, move = between(poses, pairs)
     noise = 0.05 * random.standard_normal((2, len(pairs), 3))
     turn = turn @ Rotation.from_rotvec(noise[0]).as_matrix()
     whitening = np.eye(6) / ([0.05] * 3 + [0.1] * 3)
-    return poses, pairs, {"rotation": turn, "translation": move + noise[1], "whitening": whitening[None]}
+    return (
+        poses,
+        pairs,
+        {"rotation": turn, "translation": move + noise[1], "whitening": whitening[None]},
+    )
 
 
 def between(poses: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -37,7 +44,11 @@ def between(poses: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def as_problem(poses: np.ndarray) -> jaxba.BundleProblem:
     turned = AXES[:, None] * Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    cameras = [Rotation.from_matrix(turned).as_rotvec(), AXES * poses[:, 3:], np.ones((len(poses), 3))]
+    cameras = [
+        Rotation.from_matrix(turned).as_rotvec(),
+        AXES * poses[:, 3:],
+        np.ones((len(poses), 3)),
+    ]
     return jaxba.BundleProblem.create(np.hstack(cameras))
 
 
@@ -56,7 +67,9 @@ def test_a_pose_graph_has_covariances():
 def test_a_pose_graph_ends_where_scipy_does():
     poses, pairs, measured = graph()
     problem = held_graph()
-    solution = jaxba.solve(problem, "ceres", jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15)))
+    solution = jaxba.solve(
+        problem, "ceres", jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15))
+    )
     assert solution.linear_solver == "explicit"
     assert list(solution.costs) == ["pixels", "relative_pose"]
     np.testing.assert_array_equal(solution.problem.cameras[:, 6:], problem.cameras[:, 6:])
@@ -82,7 +95,9 @@ def test_a_pose_graph_ends_where_scipy_does():
     found = least_squares(errors, poses[1:].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert solution.final_cost == pytest.approx(found.cost, rel=1e-9)
     ends = AXES[:, None] * rotation_matrices(solution.problem.cameras[1:, :3])
-    np.testing.assert_allclose(Rotation.from_matrix(ends).as_rotvec(), found.x.reshape(-1, 6)[:, :3], atol=1e-6)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(ends).as_rotvec(), found.x.reshape(-1, 6)[:, :3], atol=1e-6
+    )
 
 
 def test_cameras_alone_are_nothing_to_solve():

@@ -91,14 +91,35 @@ def refused():
     sensors = np.ones((2, 3))
     return {
         "no parameter": (lambda _: position(pose=0, at=0.0), "residual position needs sigma"),
-        "another parameter": (lambda _: position(pose=0, lens=0, **ones), "residual position has no lens"),
-        "lengths": (lambda _: depths(pose=[0, 1], point=[0, 1, 2], image=0), "pose of depth must be a vector of 3"),
-        "not an index": (lambda _: position(pose=0.5, **ones), "pose of position must be a vector of 1 integers"),
-        "not finite": (lambda _: position(pose=0, at=np.nan, sigma=1.0), "at of position must be finite"),
+        "another parameter": (
+            lambda _: position(pose=0, lens=0, **ones),
+            "residual position has no lens",
+        ),
+        "lengths": (
+            lambda _: depths(pose=[0, 1], point=[0, 1, 2], image=0),
+            "pose of depth must be a vector of 3",
+        ),
+        "not an index": (
+            lambda _: position(pose=0.5, **ones),
+            "pose of position must be a vector of 1 integers",
+        ),
+        "not finite": (
+            lambda _: position(pose=0, at=np.nan, sigma=1.0),
+            "at of position must be finite",
+        ),
         "no rows": (of(position), "rows must be those of a residual, called with indices and data"),
-        "no such camera": (of(position(pose=CAMERAS, **ones)), rf"pose of position\[0\] is {CAMERAS}, outside"),
-        "no such point": (of(control_point(point=-1, **ones)), r"point of control_point\[0\] is -1, outside"),
-        "no start": (of(depths(pose=0, point=0, image=0)), "image of residual depth has no start: give unknowns"),
+        "no such camera": (
+            of(position(pose=CAMERAS, **ones)),
+            rf"pose of position\[0\] is {CAMERAS}, outside",
+        ),
+        "no such point": (
+            of(control_point(point=-1, **ones)),
+            r"point of control_point\[0\] is -1, outside",
+        ),
+        "no start": (
+            of(depths(pose=0, point=0, image=0)),
+            "image of residual depth has no start: give unknowns",
+        ),
         "start of another shape": (
             of(depths(pose=0, point=0, image=0), unknowns={"image": 1.0}),
             "unknown image must have finite numbers, 1 to 5 rows",
@@ -107,7 +128,10 @@ def refused():
             of(depths(pose=0, point=0, image=0), unknowns={"image": np.ones((CAMERAS + 1, 2))}),
             "unknown image must have finite numbers, 1 to 5 rows",
         ),
-        "no parameter of it": (of(position(pose=0, **ones), unknowns={"foo": [[1.0]]}), "unknown foo is no parameter"),
+        "no parameter of it": (
+            of(position(pose=0, **ones), unknowns={"foo": [[1.0]]}),
+            "unknown foo is no parameter",
+        ),
         "no dict": (of(position(pose=0, **ones), unknowns=[1]), "unknowns a dict"),
         "two points with a camera": (
             of(between_points(pose=0, point=0, point_2=1)),
@@ -118,27 +142,45 @@ def refused():
             "two points in a row, so at most 6 numbers, not 9",
         ),
         "no function": (lambda _: jaxba.residual(3), "made of a function"),
-        "a taken name": (of(position(pose=0, **ones), unknowns={"lens": [[1.0]]}), "may not be named lens"),
+        "a taken name": (
+            of(position(pose=0, **ones), unknowns={"lens": [[1.0]]}),
+            "may not be named lens",
+        ),
         "two cameras": (
             of(depths(pose=0, point=0, image=1), unknowns=image),
             "row 0 of .* depth: image 1 is not",
         ),
-        "nothing depends": (of(idle(pose=0, point=0, at=1.0)), "residual idle depends on pose in no row"),
-        "infinite": (of(logarithm(point=0, at=1e6)), "residual logarithm is not finite at the start in row 0"),
+        "nothing depends": (
+            of(idle(pose=0, point=0, at=1.0)),
+            "residual idle depends on pose in no row",
+        ),
+        "infinite": (
+            of(logarithm(point=0, at=1e6)),
+            "residual logarithm is not finite at the start in row 0",
+        ),
         "a short block": (
             of(depths(pose=0, point=0, image=0), unknowns={"image": np.ones((CAMERAS, 1))}),
             "residual depth cannot be computed: .*index 1 out of bounds for axis 0 with size 1",
         ),
-        "complex": (of(complex_numbers(point=0)), "residual complex_numbers cannot be computed: .*it returns complex"),
+        "complex": (
+            of(complex_numbers(point=0)),
+            "residual complex_numbers cannot be computed: .*it returns complex",
+        ),
         "a matrix": (of(table(point=0)), "residual table must return a number or a vector"),
         "an error": (of(broken(point=0)), "residual broken cannot be computed: .*nothing"),
-        "derivative": (of(wrong_derivative(point=0)), "derivatives of residual wrong_derivative do not agree"),
+        "derivative": (
+            of(wrong_derivative(point=0)),
+            "derivatives of residual wrong_derivative do not agree",
+        ),
         "two sensors": (
             of(shared(pose=[0, 0], sensor=[0, 1], at=0.0), unknowns={"sensor": sensors}),
             "camera 0 has two rows of the unknown sensor",
         ),
         "loss": (of(position(pose=0, **ones), loss="huber"), "loss must be a jaxba.Loss"),
-        "default": (lambda _: jaxba.residual(lambda pose, *, at=1: at), "no \\*, \\*\\* and defaults"),
+        "default": (
+            lambda _: jaxba.residual(lambda pose, *, at=1: at),
+            "no \\*, \\*\\* and defaults",
+        ),
         "no unknown": (lambda _: jaxba.residual(lambda *, at: at), "has no unknown"),
     }
 
@@ -152,10 +194,13 @@ def test_what_is_wrong_with_a_residual_is_said_in_one_line(what, unchecked):
 
 
 def everything() -> jaxba.BundleProblem:
-    """Positions, depths with a block for each camera, relative poses, and scale bars in one problem."""
+    """Positions, depths with a block for each camera, relative poses, and scale bars in one
+    problem."""
     problem = example("depth")[0]
     centers = geometry.camera_centers(problem.cameras)
-    problem = jaxba.with_residual(problem, position(pose=[0, 2], at=centers[[0, 2]] + 0.01, sigma=0.1))
+    problem = jaxba.with_residual(
+        problem, position(pose=[0, 2], at=centers[[0, 2]] + 0.01, sigma=0.1)
+    )
     turn, shift = np.eye(3), np.array([1.0, 0.0, 0.0])
     rows = relative_pose(pose=[0, 1], pose_2=[1, 2], turn=turn[None], shift=shift, sigma=2.0)
     problem = jaxba.with_residual(problem, rows, loss=jaxba.Loss("cauchy"))
@@ -182,7 +227,9 @@ def test_rows_of_a_point_that_goes_go_and_the_others_stay():
     problem = everything()
     kept = problem.subset(problem.point_index != 4, points=np.delete(np.arange(POINTS), 4))
     assert kept.num_points == POINTS - 1
-    of = dict(zip(["depth", "position", "relative_pose", "apart"], kept.residuals.rows, strict=True))
+    of = dict(
+        zip(["depth", "position", "relative_pose", "apart"], kept.residuals.rows, strict=True)
+    )
     before, after = problem.residuals.rows[0].points[0], of["depth"].points[0]
     np.testing.assert_array_equal(kept.points[after], problem.points[before[before != 4]])
     np.testing.assert_array_equal([own[0] for own in of["apart"].points], [0, 8])
@@ -213,7 +260,9 @@ def test_a_function_whose_globals_have_changed_is_compiled_anew():
     rows = near(point=np.arange(5), at=0.0)
     costs = []
     for sigma[0] in (1.0, 0.1):
-        solution = jaxba.solve(jaxba.with_residual(problem, rows), "ceres", jaxba.SolveOptions(max_iterations=0))
+        solution = jaxba.solve(
+            jaxba.with_residual(problem, rows), "ceres", jaxba.SolveOptions(max_iterations=0)
+        )
         costs.append(solution.costs["near"])
         assert solution.initial_cost == pytest.approx(sum(solution.costs.values()))
         pixels = 0.5 * np.sum(geometry.residuals(problem) ** 2)
@@ -223,11 +272,18 @@ def test_a_function_whose_globals_have_changed_is_compiled_anew():
 
 @pytest.mark.slow
 def test_a_gauge_holds_no_scale_that_scale_bars_know():
-    problem = jaxba.with_residual(scene(), distance(point=[0, 3], point_2=[7, 8], length=9.0, sigma=0.1))
+    problem = jaxba.with_residual(
+        scene(), distance(point=[0, 3], point_2=[7, 8], length=9.0, sigma=0.1)
+    )
     tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-14, 1e-14, 1e-14), max_iterations=300)
-    ends = [jaxba.solve(p, "ceres", tight).final_cost for p in (problem, jaxba.with_gauge(problem, "two-cameras"))]
+    ends = [
+        jaxba.solve(p, "ceres", tight).final_cost
+        for p in (problem, jaxba.with_gauge(problem, "two-cameras"))
+    ]
     assert ends[1] == pytest.approx(ends[0], rel=1e-8)
-    with pytest.warns(jaxba.ProblemWarning, match="1 of 7 directions of the scene are fixed already"):
+    with pytest.warns(
+        jaxba.ProblemWarning, match="1 of 7 directions of the scene are fixed already"
+    ):
         jaxba.with_gauge(problem, "three-points")
 
 
@@ -236,7 +292,10 @@ def test_a_problem_with_residuals_can_be_pickled_and_compared():
         everything(), geometry.camera_centers(scene().cameras), stddev=1.0, align=False
     )
     assert pickle.loads(pickle.dumps(problem)) == problem
-    assert "2 rows of position, 2 rows of relative_pose, 2 rows of apart, 5 rows of position_prior" in repr(problem)
+    assert (
+        "2 rows of position, 2 rows of relative_pose, 2 rows of apart, 5 rows of position_prior"
+        in repr(problem)
+    )
 
 
 @pytest.mark.slow
@@ -246,7 +305,10 @@ def test_points_are_looked_for_anew_with_all_residuals():
     points[3] *= 40.0
     found = jaxba.retriangulate(problem.replace(points=points))
     assert found.moved >= 1
-    costs = [jaxba.solve(x, options=jaxba.SolveOptions(max_iterations=0)).final_cost for x in (problem, found.problem)]
+    costs = [
+        jaxba.solve(x, options=jaxba.SolveOptions(max_iterations=0)).final_cost
+        for x in (problem, found.problem)
+    ]
     assert found.cost_after == pytest.approx(costs[1], rel=1e-9)
     assert costs[1] < 1.01 * costs[0]
 
@@ -255,7 +317,10 @@ def test_points_are_looked_for_anew_with_all_residuals():
 def test_other_types_and_levels_of_compilation_end_at_the_same_cost():
     problem = everything()
     truth = jaxba.solve(problem, "bold").final_cost
-    for options in (jaxba.SolveOptions(dtype="mixed", compilation="full"), jaxba.SolveOptions(dtype="float32")):
+    for options in (
+        jaxba.SolveOptions(dtype="mixed", compilation="full"),
+        jaxba.SolveOptions(dtype="float32"),
+    ):
         assert jaxba.solve(problem, "bold", options).final_cost == pytest.approx(truth, rel=1e-3)
 
 

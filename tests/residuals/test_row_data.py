@@ -1,4 +1,5 @@
-"""Data of residuals: one value, or one a row, of the shape that a value has, and of values that make sense."""
+"""Data of residuals: one value, or one a row, of the shape that a value has, and of values that
+make sense."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def test_ready_made_residuals_take_one_value_or_one_a_row(name):
     rows, _ = row_of(name, scene())
     for key, values in zip(rows.residual.data, rows.data, strict=True):
         for one in (values[:1], values[0]):
-            same = dict(zip(rows.residual.data, again(name, **{key: lambda _, x=one: x}).data, strict=True))
+            same = dict(
+                zip(rows.residual.data, again(name, **{key: lambda _, x=one: x}).data, strict=True)
+            )
             np.testing.assert_array_equal(same[key], np.broadcast_to(values[0], values.shape))
         for count in (len(values) - 1, len(values) + 1):
             message = f"^{key} of {name} has {count} rows, there are {len(values)} residuals"
@@ -76,10 +79,25 @@ def test_no_rows_are_rows():
 @pytest.mark.parametrize(
     ("name", "key", "value", "message"),
     [
-        ("distance", "length", np.ones((COUNT, 3)), r"must be a number in a row, not an array of shape \(4, 3\)"),
-        ("control_point", "position", 0.0, r"must be 3 numbers in a row, not an array of shape \(\)"),
+        (
+            "distance",
+            "length",
+            np.ones((COUNT, 3)),
+            r"must be a number in a row, not an array of shape \(4, 3\)",
+        ),
+        (
+            "control_point",
+            "position",
+            0.0,
+            r"must be 3 numbers in a row, not an array of shape \(\)",
+        ),
         ("control_point", "whitening", np.ones(3), "must be n x 3 numbers in a row"),
-        ("relative_pose", "whitening", np.eye(3), r"must be n x 6 numbers in a row, not an array of shape \(3, 3\)"),
+        (
+            "relative_pose",
+            "whitening",
+            np.eye(3),
+            r"must be n x 6 numbers in a row, not an array of shape \(3, 3\)",
+        ),
         ("gravity", "sigma", np.ones(3), "sigma of gravity has 3 rows, there are 4 residuals"),
     ],
 )
@@ -114,7 +132,9 @@ def test_values_that_cannot_be_are_refused_with_the_name_of_the_row(name, key, c
     rows = again(name, **{key: lambda x: np.concatenate([x[:2], change(x[2:3]), x[3:]])})
     kind = rows.residual.unknowns[0]
     place = "point 12" if kind == "point" else f"image {rows.index[0][2] + 1} "
-    with pytest.raises(ValueError, match=f"^{key} of {name} must be {what}, not .*{place}") as caught:
+    with pytest.raises(
+        ValueError, match=f"^{key} of {name} must be {what}, not .*{place}"
+    ) as caught:
         jaxba.with_residual(problem, rows, unknowns=unknowns)
     assert "\n" not in str(caught.value)
 

@@ -1,4 +1,5 @@
-"""Every kind of row of a residual of one's own, against SciPy's least squares on the same cost written once more."""
+"""Every kind of row of a residual of one's own, against SciPy's least squares on the same cost
+written once more."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def relative_pose(pose, pose_2, *, turn, shift, sigma):
 
 @jaxba.residual
 def drift(pose, pose_2, clock, clock_2, *, measured):
-    return 5.0 * (jnp.sum((pose.center - pose_2.center) ** 2) * (1 + clock[0]) - clock_2[0] - measured)
+    return 5.0 * (
+        jnp.sum((pose.center - pose_2.center) ** 2) * (1 + clock[0]) - clock_2[0] - measured
+    )
 
 
 @jaxba.residual
@@ -66,7 +69,9 @@ def scene() -> jaxba.BundleProblem:
     return random_scene(SceneConfig(CAMERAS, POINTS, CAMERAS * POINTS), 3)
 
 
-def depths(problem: jaxba.BundleProblem, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def depths(
+    problem: jaxba.BundleProblem, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cameras, points and depths in one unit, of a third of the observations."""
     chosen = rng.permutation(problem.num_observations)[: problem.num_observations // 3]
     camera, point = problem.camera_index[chosen], problem.point_index[chosen]
@@ -102,7 +107,8 @@ KINDS = {
 
 
 def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
-    """A problem with rows of a kind, and these residuals as a function of cameras, points and blocks."""
+    """A problem with rows of a kind, and these residuals as a function of cameras, points and
+    blocks."""
     problem, rng = scene(), np.random.default_rng(1)
     centers = geometry.camera_centers(problem.cameras)
     add, all_cameras = jaxba.with_residual, np.arange(CAMERAS)
@@ -112,7 +118,10 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
         found = add(problem, position(pose=all_cameras, at=at, sigma=0.02))
         return found, lambda cameras, points, _: (jax.vmap(center)(cameras) - at) / 0.02
     if kind == "control":
-        which, at = np.arange(0, POINTS, 3), problem.points[::3] + 0.03 * rng.standard_normal((POINTS // 3, 3))
+        which, at = (
+            np.arange(0, POINTS, 3),
+            problem.points[::3] + 0.03 * rng.standard_normal((POINTS // 3, 3)),
+        )
         sigma = np.linspace(0.01, 0.1, len(which))[:, None]
         found = add(problem, control_point(point=which, at=at, sigma=sigma))
         return found, lambda cameras, points, _: (points[which] - at) / sigma
@@ -134,26 +143,37 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
     if kind == "relative":
         first, second = np.array([0, 1, 2, 4]), np.array([1, 2, 3, 0])
         truth = [pose(jnp.asarray(c)) for c in problem.cameras]
-        turn = np.array([np.asarray(truth[j][0] @ truth[i][0].T) for i, j in zip(first, second, strict=True)])
+        turn = np.array(
+            [np.asarray(truth[j][0] @ truth[i][0].T) for i, j in zip(first, second, strict=True)]
+        )
         turn = Rotation.from_rotvec(0.02 * rng.standard_normal((4, 3))).as_matrix() @ turn
         moved = [
-            np.asarray(truth[j][1]) - t @ np.asarray(truth[i][1]) for i, j, t in zip(first, second, turn, strict=True)
+            np.asarray(truth[j][1]) - t @ np.asarray(truth[i][1])
+            for i, j, t in zip(first, second, turn, strict=True)
         ]
         sigma = np.array([0.01] * 3 + [0.05] * 3)
-        found = add(problem, relative_pose(pose=first, pose_2=second, turn=turn, shift=moved, sigma=sigma))
+        found = add(
+            problem, relative_pose(pose=first, pose_2=second, turn=turn, shift=moved, sigma=sigma)
+        )
 
         def of(one, other, turn, shift):
             (r1, t1), (r2, t2) = pose(one), pose(other)
             off = r2 @ r1.T @ turn.T
-            axis = jnp.array([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]) / 2
+            axis = (
+                jnp.array([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]) / 2
+            )
             return jnp.concatenate([axis, t2 - r2 @ r1.T @ t1 - shift]) / sigma
 
         given = turn, np.array(moved)
-        return found, lambda cameras, points, _: jax.vmap(of)(cameras[first], cameras[second], *given)
+        return found, lambda cameras, points, _: jax.vmap(of)(
+            cameras[first], cameras[second], *given
+        )
     if kind == "apart":
         first, second = np.array([0, 3, 5, 5]), np.array([7, 8, 0, 9])
         change = problem.points[second] - problem.points[first]
-        by = np.hstack([np.linalg.norm(change, axis=1)[:, None], change]) / 0.02 + rng.standard_normal((4, 4))
+        by = np.hstack(
+            [np.linalg.norm(change, axis=1)[:, None], change]
+        ) / 0.02 + rng.standard_normal((4, 4))
         found = add(problem, apart(point=first, point_2=second, by=by, sigma=0.02))
 
         def of_points(cameras, points, _):
@@ -168,7 +188,9 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
     found = add(problem, rows, unknowns={"clock": [[0.05]]})
 
     def drifted(one, other, clock, measured):
-        return 5.0 * (jnp.sum((center(one) - center(other)) ** 2) * (1 + clock[0]) - clock[0] - measured)
+        return 5.0 * (
+            jnp.sum((center(one) - center(other)) ** 2) * (1 + clock[0]) - clock[0] - measured
+        )
 
     return found, lambda cameras, points, blocks: jax.vmap(drifted, (0, 0, None, 0))(
         cameras[first], cameras[second], blocks[0][0], measured
@@ -181,19 +203,27 @@ def whole(problem: jaxba.BundleProblem, rows) -> tuple[np.ndarray, object]:
     ends = np.cumsum([x.size for x in parts])
 
     def split(x):
-        cameras, points, *blocks = [one.reshape(p.shape) for one, p in zip(jnp.split(x, ends[:-1]), parts, strict=True)]
+        cameras, points, *blocks = [
+            one.reshape(p.shape) for one, p in zip(jnp.split(x, ends[:-1]), parts, strict=True)
+        ]
         return cameras, points, blocks
 
     def residuals(x):
         cameras, points, blocks = split(x)
-        own = jax.vmap(pixels)(cameras[problem.camera_index], points[problem.point_index]) - problem.observations
+        own = (
+            jax.vmap(pixels)(cameras[problem.camera_index], points[problem.point_index])
+            - problem.observations
+        )
         return jnp.concatenate([own.ravel(), rows(cameras, points, blocks).ravel()])
 
     return np.concatenate([np.ravel(x) for x in parts]), residuals
 
 
 QUICK = ("apart",)
-SLOW = [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow, id=what) for kind, what in KINDS.items()]
+SLOW = [
+    pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow, id=what)
+    for kind, what in KINDS.items()
+]
 
 
 @pytest.mark.parametrize("kind", SLOW)
@@ -201,14 +231,26 @@ def test_rows_have_the_cost_and_the_minimum_that_scipy_finds(kind):
     problem, rows = example(kind)
     start, residuals = whole(problem, rows)
     residuals = jax.jit(residuals)
-    solution = jaxba.solve(problem, "ceres", jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15)))
-    assert solution.initial_cost == pytest.approx(0.5 * np.sum(np.square(residuals(start))), rel=1e-11)
+    solution = jaxba.solve(
+        problem, "ceres", jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15))
+    )
+    assert solution.initial_cost == pytest.approx(
+        0.5 * np.sum(np.square(residuals(start))), rel=1e-11
+    )
     found = least_squares(
-        residuals, start, jax.jit(jax.jacfwd(residuals)), x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+        residuals,
+        start,
+        jax.jit(jax.jacfwd(residuals)),
+        x_scale="jac",
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
     )
     assert solution.final_cost == pytest.approx(found.cost, rel=1e-9)
     after, _ = whole(solution.problem, rows)
-    assert 0.5 * np.sum(np.square(residuals(after))) == pytest.approx(solution.final_cost, rel=1e-11)
+    assert 0.5 * np.sum(np.square(residuals(after))) == pytest.approx(
+        solution.final_cost, rel=1e-11
+    )
 
 
 @pytest.mark.parametrize(
@@ -230,7 +272,9 @@ def test_all_solvers_and_refinements_find_the_same_minimum(policy, linear_solver
 @jaxba.residual
 def planar(state, state_2, *, bearing, distance):
     seen = turned(state, state_2)
-    return 10 * jnp.stack([jnp.arctan2(seen[1], seen[0]) - bearing, jnp.sqrt(seen @ seen) - distance])
+    return 10 * jnp.stack(
+        [jnp.arctan2(seen[1], seen[0]) - bearing, jnp.sqrt(seen @ seen) - distance]
+    )
 
 
 @jaxba.residual
@@ -251,8 +295,12 @@ def turned(state, state_2):
 def test_unknowns_of_ones_own_alone_say_that_they_have_to_be_of_one_block():
     cameras = np.tile([0.0] * 6 + [1.0, 0.0, 0.0], (5, 1))
     rows = odometry(state=[0, 1], state_2=[1, 2], move=[2.0, 0.0, 0.0])
-    with pytest.raises(jaxba.ProblemError, match=r"no residual says which .* a row for each of 5 cameras"):
-        jaxba.with_residual(jaxba.BundleProblem.create(cameras), rows, unknowns={"state": np.zeros((3, 3))})
+    with pytest.raises(
+        jaxba.ProblemError, match=r"no residual says which .* a row for each of 5 cameras"
+    ):
+        jaxba.with_residual(
+            jaxba.BundleProblem.create(cameras), rows, unknowns={"state": np.zeros((3, 3))}
+        )
 
 
 @pytest.mark.slow
@@ -261,7 +309,9 @@ def test_a_robot_in_the_plane_is_one_block_of_states_and_landmarks():
     cameras = np.tile([0.0] * 6 + [1.0, 0.0, 0.0], (5, 1))
     problem = jaxba.hold(jaxba.BundleProblem.create(cameras), poses="all")
     truth = np.array([[0, 0, 0], [2, 0, 0], [4, 0, 0], [2, 2, 0], [4, 2, 0.0]])
-    off = truth + np.array([[-0.2, 0.2, 0.1], [0.3, 0.1, -0.2], [0.1, 0.1, 0.1], [-0.2, 0.1, 0], [0.1, -0.2, 0]])
+    off = truth + np.array(
+        [[-0.2, 0.2, 0.1], [0.3, 0.1, -0.2], [0.1, 0.1, 0.1], [-0.2, 0.1, 0], [0.1, -0.2, 0]]
+    )
     rows = odometry(state=[0, 1], state_2=[1, 2], move=[2.0, 0.0, 0.0])
     problem = jaxba.with_residual(problem, rows, unknowns={"state": off})
     problem = jaxba.with_residual(problem, start(state=0))

@@ -121,7 +121,8 @@ def test_what_is_deleted_is_said():
 def test_a_point_that_is_seen_impossibly_far_from_its_pixels_comes_back(start):
     model = copy.deepcopy(start)
     image = model.images[1]
-    near = image.cam_from_world().inverse() * np.array([0.02, 0.0, 0.005])  # in front of it, far to the side
+    # in front of it, far to the side
+    near = image.cam_from_world().inverse() * np.array([0.02, 0.0, 0.005])
     model.point3D(3).xyz = near
     in_front = [(other.cam_from_world() * near)[2] > 0 for other in model.images.values()]
     assert all(in_front)
@@ -194,7 +195,9 @@ def test_a_summary_speaks_as_pycolmaps(start):
     assert summary.is_solution_usable()
     assert expected.is_solution_usable()
     assert summary.num_residuals == summary.num_residuals_reduced == expected.num_residuals
-    assert summary.brief_report().startswith(f"jaxba report: Iterations: {summary.iterations}, Initial cost: ")
+    assert summary.brief_report().startswith(
+        f"jaxba report: Iterations: {summary.iterations}, Initial cost: "
+    )
     assert cost(ours) == pytest.approx(cost(theirs), rel=1e-6)
     assert isinstance(summary, jaxba.Solution)
 
@@ -217,7 +220,11 @@ def test_a_dictionary_means_what_pycolmap_makes_of_it(start):
         ({"refine_focal": False}, "pycolmap .* has no option refine_focal$"),
         ({"ceres": {"eta": 1}}, r"has no option ceres\.eta$"),
         ({"refine_focal_length": "no"}, "could not assign refine_focal_length$"),
-        ("fast", "options must be a pycolmap.BundleAdjustmentOptions or a dictionary of its values, not 'fast'"),
+        (
+            "fast",
+            "options must be a pycolmap.BundleAdjustmentOptions or a dictionary of its values, not "
+            "'fast'",
+        ),
     ],
 )
 def test_options_that_pycolmap_does_not_have_are_refused_in_one_line(start, options, said):
@@ -236,7 +243,9 @@ def test_a_token_stops_the_solve_in_the_third_place_and_by_name(start):
     stopped = jaxba.bundle_adjustment(copy.deepcopy(start), quiet(), cancellation_token=token)
     assert stopped.iterations == 1
     assert stopped.termination_type == TYPES.NO_CONVERGENCE
-    with pytest.raises(ValueError, match=r"config must be a pycolmap\.BundleAdjustmentConfig, not 'all'"):
+    with pytest.raises(
+        ValueError, match=r"config must be a pycolmap\.BundleAdjustmentConfig, not 'all'"
+    ):
         jaxba.bundle_adjustment(copy.deepcopy(start), quiet(), "all")
 
 
@@ -265,9 +274,13 @@ def test_a_time_limit_ends_the_solve(start, monkeypatch):
 def test_a_time_limit_below_the_set_up_leaves_the_start_as_in_colmap(start):
     ours, theirs = copy.deepcopy(start), copy.deepcopy(start)
     options = quiet(max_solver_time_in_seconds=1e-6)
-    with pytest.warns(jaxba.ProblemWarning, match="the time limit was over before the first iteration"):
+    with pytest.warns(
+        jaxba.ProblemWarning, match="the time limit was over before the first iteration"
+    ):
         summary = jaxba.create_default_bundle_adjuster(options, configuration(ours), ours).solve()
-    expected = pycolmap.create_default_bundle_adjuster(options, configuration(theirs), theirs).solve()
+    expected = pycolmap.create_default_bundle_adjuster(
+        options, configuration(theirs), theirs
+    ).solve()
     assert summary.iterations == 0
     assert summary.termination_type == expected.termination_type == TYPES.NO_CONVERGENCE
     assert cost(ours) == pytest.approx(cost(theirs), rel=1e-12)
@@ -320,15 +333,24 @@ def test_pose_priors_end_where_pycolmaps_do(start, loss):
     pycolmap.create_pose_prior_bundle_adjuster(*arguments, theirs).solve()
     assert jaxba.create_pose_prior_bundle_adjuster(*arguments, ours).solve().converged
     for number, image in theirs.images.items():
-        np.testing.assert_allclose(ours.images[number].projection_center(), image.projection_center(), atol=1e-6)
+        np.testing.assert_allclose(
+            ours.images[number].projection_center(), image.projection_center(), atol=1e-6
+        )
     assert np.linalg.norm(ours.points3D[max(ours.points3D)].xyz - [10, 20, 30]) < 6
 
 
 def test_priors_that_say_nothing_are_refused(start):
     config = configuration(start)
-    for priors, said in (([], "no image of the config has a position"), ([degrees(start)], "image 1 is in degrees")):
+    for priors, said in (
+        ([], "no image of the config has a position"),
+        ([degrees(start)], "image 1 is in degrees"),
+    ):
         adjuster = jaxba.create_pose_prior_bundle_adjuster(
-            quiet(), pycolmap.PosePriorBundleAdjustmentOptions(), config, priors, copy.deepcopy(start)
+            quiet(),
+            pycolmap.PosePriorBundleAdjustmentOptions(),
+            config,
+            priors,
+            copy.deepcopy(start),
         )
         with pytest.raises(ValueError, match=f"^pose_priors: .*{said}"):
             adjuster.solve()

@@ -1,4 +1,5 @@
-"""Covariances where not everything is determined are those of the dense pseudo-inverse, and NaN for the rest."""
+"""Covariances where not everything is determined are those of the dense pseudo-inverse, and NaN for
+the rest."""
 
 from __future__ import annotations
 
@@ -7,23 +8,35 @@ import pytest
 import support
 from support import solved
 
-from jaxba import BundleProblem, ProblemError, ProblemWarning, StepOptions, covariance, hold, with_gauge
+from jaxba import (
+    BundleProblem,
+    ProblemError,
+    ProblemWarning,
+    StepOptions,
+    covariance,
+    hold,
+    with_gauge,
+)
 from jaxba.problem.labels import Labels
 from jaxba.problem.options import Coordinates
 
 
 def weak() -> BundleProblem:
-    """Camera 4 has four observations, camera 5 a constant pose and one, point 7 one; nothing sees point 9."""
+    """Camera 4 has four observations, camera 5 a constant pose and one, point 7 one; nothing sees
+    point 9."""
     problem = hold(with_gauge(solved(), "two-cameras"), poses=[5])
     camera, point = problem.camera_index, problem.point_index
     of_camera = lambda at: np.cumsum(camera == at) * (camera == at)
     kept = (of_camera(4) <= 4) & (of_camera(5) <= 1) & (point != 9)
     kept &= (point != 7) | (np.cumsum((point == 7) & kept) <= 1)
-    return problem.replace(observations=problem.observations[kept], camera_index=camera[kept], point_index=point[kept])
+    return problem.replace(
+        observations=problem.observations[kept], camera_index=camera[kept], point_index=point[kept]
+    )
 
 
 def dense(problem: BundleProblem) -> np.ndarray:
-    """The pseudo-inverse of the whole information matrix, NaN for numbers with a part in its null space."""
+    """The pseudo-inverse of the whole information matrix, NaN for numbers with a part in its null
+    space."""
     _, jacobian = support.linear(problem, StepOptions(coordinates=Coordinates(rotation="manifold")))
     constant = np.zeros(problem.cameras.shape, bool)
     constant[:, :6] = problem.constants.poses
@@ -43,7 +56,9 @@ def dense(problem: BundleProblem) -> np.ndarray:
 
 
 def close(found: np.ndarray, wanted: np.ndarray) -> None:
-    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7 * np.nan_to_num(np.abs(wanted)).max() + 1e-14)
+    np.testing.assert_allclose(
+        found, wanted, rtol=1e-4, atol=1e-7 * np.nan_to_num(np.abs(wanted)).max() + 1e-14
+    )
 
 
 def test_what_is_determined_has_the_covariance_of_the_dense_pseudo_inverse():
@@ -61,25 +76,34 @@ def test_what_is_determined_has_the_covariance_of_the_dense_pseudo_inverse():
     for point in range(problem.num_points):
         at = 9 * 6 + 3 * point + np.arange(3)
         close(found.points[point], whole[np.ix_(at, at)])
-    lost = [np.flatnonzero(np.isnan(x).any(axis=(1, 2))).tolist() for x in (found.poses, found.lenses, found.points)]
-    once = np.flatnonzero(np.bincount(problem.point_index, minlength=problem.num_points) < 2).tolist()
+    lost = [
+        np.flatnonzero(np.isnan(x).any(axis=(1, 2))).tolist()
+        for x in (found.poses, found.lenses, found.points)
+    ]
+    once = np.flatnonzero(
+        np.bincount(problem.point_index, minlength=problem.num_points) < 2
+    ).tolist()
     assert lost == [[4], [4, 5], once]
     assert np.isnan(np.diagonal(found.between(1, 4))).tolist() == [False] * 6 + [True] * 6
 
 
 def test_a_point_that_is_nearly_not_determined_changes_no_other_covariance():
-    """Rays of one point are parallel to within the given angle: its information is a share of that squared."""
+    """Rays of one point are parallel to within the given angle: its information is a share of that
+    squared."""
     problem = hold(with_gauge(solved(), "two-cameras"), lenses="all")
     without = problem.point_index != 7
     names = ("observations", "camera_index", "point_index")
-    wanted = covariance(problem.replace(**{name: getattr(problem, name)[without] for name in names}))
+    wanted = covariance(
+        problem.replace(**{name: getattr(problem, name)[without] for name in names})
+    )
     for distance in (1e4, 1e6):
         points = np.array(problem.points)
         points[7] *= distance
         found = covariance(problem.replace(points=points))
         others = np.arange(problem.num_points) != 7
         assert np.isfinite(found.points).all()
-        # a point at infinity says something of rotations alone: variances become smaller, by a little
+        # a point at infinity says something of rotations alone: variances become smaller, by a
+        # little
         assert (np.diagonal(found.points[others], axis1=1, axis2=2) > 0).all()
         near = lambda x: np.diagonal(x, axis1=1, axis2=2)
         assert (near(found.points[others]) <= near(wanted.points[others]) * (1 + 1e-6)).all()

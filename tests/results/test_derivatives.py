@@ -26,14 +26,19 @@ def scene() -> jaxba.BundleProblem:
 
 
 def constrained() -> jaxba.BundleProblem:
-    """One lens for all, a constant pose, a constant point and number, and measured positions of four cameras."""
+    """One lens for all, a constant pose, a constant point and number, and measured positions of
+    four cameras."""
     plain, rng = scene(), np.random.default_rng(0)
     cameras = np.array(plain.cameras)
     cameras[:, 6:] = cameras[0, 6:]
     lenses = jaxba.Lenses(np.zeros(6, np.int32), np.ones((1, 3), bool))
-    problem = jaxba.hold(plain.replace(cameras=cameras, lenses=lenses), poses=[0], points=[3], numbers=["k2"])
+    problem = jaxba.hold(
+        plain.replace(cameras=cameras, lenses=lenses), poses=[0], points=[3], numbers=["k2"]
+    )
     places = geometry.camera_centers(cameras)[1:5] + 0.05 * rng.normal(size=(4, 3))
-    return jaxba.with_position_priors(problem, places, 0.01 * np.eye(3), images=[1, 2, 3, 4], align=False)
+    return jaxba.with_position_priors(
+        problem, places, 0.01 * np.eye(3), images=[1, 2, 3, 4], align=False
+    )
 
 
 @pytest.mark.slow
@@ -49,19 +54,30 @@ def test_compiled_and_mapped_derivatives_are_those_of_single_solves(make):
     for number, one in enumerate(pixels):
         cost, gradient = jax.value_and_grad(value)(one)
         assert found[0][number] == pytest.approx(float(cost), rel=1e-6)
-        np.testing.assert_allclose(found[1][number], gradient, atol=1e-5 * float(jnp.abs(gradient).max()))
-    rows = jax.jacrev(lambda pixels: solved(inputs._replace(observations=pixels))[0][:2, 6])(pixels[0])
+        np.testing.assert_allclose(
+            found[1][number], gradient, atol=1e-5 * float(jnp.abs(gradient).max())
+        )
+    rows = jax.jacrev(lambda pixels: solved(inputs._replace(observations=pixels))[0][:2, 6])(
+        pixels[0]
+    )
     one = jax.grad(lambda pixels: solved(inputs._replace(observations=pixels))[0][1, 6])(pixels[0])
     np.testing.assert_allclose(rows[1], one, atol=1e-6 * float(jnp.abs(one).max()))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
-def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_differences(linear_solver):
+def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_differences(
+    linear_solver,
+):
     problem, rng = constrained(), np.random.default_rng(1)
-    problem = problem.replace(whitening=np.tile(np.array([[1.0, 0.3], [0.3, 0.8]]), (problem.num_observations, 1, 1)))
+    problem = problem.replace(
+        whitening=np.tile(np.array([[1.0, 0.3], [0.3, 0.8]]), (problem.num_observations, 1, 1))
+    )
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
-    weights = rng.normal(size=problem.cameras.shape) * [1, 1, 1, 1, 1, 1, 1e-3, 1, 1], rng.normal(size=(40, 3))
+    weights = (
+        rng.normal(size=problem.cameras.shape) * [1, 1, 1, 1, 1, 1, 1e-3, 1, 1],
+        rng.normal(size=(40, 3)),
+    )
 
     def value(linear_solver: str, inputs) -> jax.Array:
         options = dataclasses.replace(TIGHT, linear_solver=linear_solver)
@@ -74,13 +90,17 @@ def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_d
         "observations": inputs.observations.at[7, 1].add(1.0) - inputs.observations,
         "residuals": ((position.at[1, 1].add(1.0) - position, jnp.zeros_like(whitening)),),
         "whitening": jnp.zeros_like(inputs.whitening).at[:30, 0].set(1.0),
-        "cameras": jnp.zeros_like(inputs.cameras).at[0, 4].set(1.0).at[:, 8].set(0.3),  # k2 is one number of all
+        # k2 is one number of all
+        "cameras": jnp.zeros_like(inputs.cameras).at[0, 4].set(1.0).at[:, 8].set(0.3),
         "points": jnp.zeros_like(inputs.points).at[3, 0].set(1.0),
     }
     for name, change in steps.items():
         start = getattr(inputs, name)
         at = lambda step, *pair: jax.tree.map(lambda x, d: x + step * d, *pair)
-        ends = [value("explicit", inputs._replace(**{name: at(step, start, change)})) for step in (1e-3, -1e-3)]
+        ends = [
+            value("explicit", inputs._replace(**{name: at(step, start, change)}))
+            for step in (1e-3, -1e-3)
+        ]
         wanted = float(ends[0] - ends[1]) / 2e-3
         products = jax.tree.map(lambda a, b: float(jnp.sum(a * b)), getattr(found, name), change)
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), wanted, rtol=5e-3)
@@ -98,14 +118,25 @@ def test_the_scale_of_a_loss_is_an_input_by_what_whitens():
     eye = jnp.tile(jnp.eye(2), (problem.num_observations, 1, 1))
     options = lambda scale: dataclasses.replace(TIGHT, loss=jaxba.Loss("cauchy", scale))
     solved = differentiable_solve(problem.replace(whitening=np.array(eye)), "ceres", options(1.0))
-    weights = np.random.default_rng(3).normal(size=problem.cameras.shape) * [1, 1, 1, 1, 1, 1, 1e-3, 1, 1]
+    weights = np.random.default_rng(3).normal(size=problem.cameras.shape) * [
+        1,
+        1,
+        1,
+        1,
+        1,
+        1,
+        1e-3,
+        1,
+        1,
+    ]
 
     def value(scale) -> jax.Array:
         scaled = inputs._replace(whitening=eye / scale, residuals=((position, whitening / scale),))
         return jnp.sum(weights * solved(scaled)[0])
 
     ends = [
-        np.sum(weights * jaxba.solve(problem, "ceres", options(0.6 + step)).problem.cameras) for step in (1e-3, -1e-3)
+        np.sum(weights * jaxba.solve(problem, "ceres", options(0.6 + step)).problem.cameras)
+        for step in (1e-3, -1e-3)
     ]
     assert float(jax.grad(value)(0.6)) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=5e-3)
 
@@ -128,7 +159,10 @@ def shared(problem: jaxba.BundleProblem) -> jaxba.BundleProblem:
 
 def in_rig(problem: jaxba.BundleProblem) -> jaxba.BundleProblem:
     """Cameras 0 and 1 in a frame: the lens of camera 1 has a place in the rig."""
-    matrices, moved = geometry.rotation_matrices(problem.cameras[:, :3]), np.array(problem.cameras[:, 3:6])
+    matrices, moved = (
+        geometry.rotation_matrices(problem.cameras[:, :3]),
+        np.array(problem.cameras[:, 3:6]),
+    )
     turn, place = np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3))
     turn[1] = matrices[1] @ matrices[0].T
     place[1] = moved[1] - turn[1] @ moved[0]
@@ -165,8 +199,11 @@ SETTINGS = {  # of each how many directions of a similarity are free
 }
 
 
-def from_a_body(problem: jaxba.BundleProblem, free: bool = False, apart: float = 1.0) -> jaxba.BundleProblem:
-    """A rig whose axes are those of no camera: camera 1 is `apart` times as far from camera 0 as it was."""
+def from_a_body(
+    problem: jaxba.BundleProblem, free: bool = False, apart: float = 1.0
+) -> jaxba.BundleProblem:
+    """A rig whose axes are those of no camera: camera 1 is `apart` times as far from camera 0 as it
+    was."""
     rig, cameras = in_rig(problem), np.array(problem.cameras)
     assert rig.rigs is not None
     turn, place = rig.rigs.rotation, np.tile([0.2, -0.1, 0.3], (5, 1))
@@ -182,9 +219,15 @@ def from_a_body(problem: jaxba.BundleProblem, free: bool = False, apart: float =
 DIRECTIONS = SETTINGS | {
     "rig of a body": (from_a_body, 6),
     "rig of a body, a free place": (lambda p: from_a_body(p, free=True), 7),
-    "rig of a body, a free place and a pose held": (lambda p: jaxba.hold(from_a_body(p, free=True), poses=[1]), 0),
+    "rig of a body, a free place and a pose held": (
+        lambda p: jaxba.hold(from_a_body(p, free=True), poses=[1]),
+        0,
+    ),
     "rig of a body, at one place": (lambda p: from_a_body(p, apart=0.0), 7),
-    "rig of a body, a free place, positions of two": (lambda p: measured(from_a_body(p, free=True)), 1),
+    "rig of a body, a free place, positions of two": (
+        lambda p: measured(from_a_body(p, free=True)),
+        1,
+    ),
 }
 
 
@@ -195,52 +238,74 @@ def test_free_directions_of_the_gauge_change_no_residual_and_nothing_that_is_hel
     here = in_frames(problem)
     cameras, points = free_directions(problem)
     assert len(cameras) == len(points) == 7 - fixed_freedoms(problem) == count
-    size = np.abs(cameras).max(axis=(1, 2), initial=0.0) + np.abs(points).max(axis=(1, 2), initial=0.0)
+    size = np.abs(cameras).max(axis=(1, 2), initial=0.0) + np.abs(points).max(
+        axis=(1, 2), initial=0.0
+    )
     assert (size > 0.1).all()
 
     def moved(scale: float, of_cameras, of_points) -> jaxba.BundleProblem:
         found = here.cameras + scale * of_cameras
-        turns = Rotation.from_rotvec(scale * of_cameras[:, :3]) * Rotation.from_rotvec(here.cameras[:, :3])
+        turns = Rotation.from_rotvec(scale * of_cameras[:, :3]) * Rotation.from_rotvec(
+            here.cameras[:, :3]
+        )
         found[:, :3] = turns.as_rotvec()
         there = here.replace(cameras=found, points=here.points + scale * of_points)
         return there if here.rigs is None else there.replace(cameras=out_of_frames(there, found)[0])
 
     def changes(value) -> np.ndarray:
         step = 1e-5
-        ends = [[value(moved(s, *one)) for one in zip(cameras, points, strict=True)] for s in (step, -step)]
+        ends = [
+            [value(moved(s, *one)) for one in zip(cameras, points, strict=True)]
+            for s in (step, -step)
+        ]
         return (np.array(ends[0]) - np.array(ends[1])) / (2 * step)
 
     if count:
-        np.testing.assert_allclose(changes(geometry.project), 0.0, atol=1e-4)  # of pixels, per extent of the scene
+        # of pixels, per extent of the scene
+        np.testing.assert_allclose(changes(geometry.project), 0.0, atol=1e-4)
     if problem.constants is not None:
         assert (points[:, np.asarray(problem.constants.points)] == 0).all()
         assert (cameras[:, :, :6][:, np.asarray(problem.constants.poses)] == 0).all()
     if problem.residuals:
-        np.testing.assert_allclose(changes(lambda p: geometry.camera_centers(p.cameras)[[1, 3]]), 0.0, atol=1e-8)
+        np.testing.assert_allclose(
+            changes(lambda p: geometry.camera_centers(p.cameras)[[1, 3]]), 0.0, atol=1e-8
+        )
 
 
 def test_what_determines_a_point_are_rays_that_are_not_parallel():
     problem = seen_once(jaxba.hold(small(), points=[3]))
     found = determined_directions(problem)
     ray = (
-        problem.points[7] - geometry.camera_centers(problem.cameras)[problem.camera_index[problem.point_index == 7][0]]
+        problem.points[7]
+        - geometry.camera_centers(problem.cameras)[
+            problem.camera_index[problem.point_index == 7][0]
+        ]
     )
     np.testing.assert_allclose(found[7] @ ray, 0, atol=1e-12)
-    np.testing.assert_array_equal(np.linalg.matrix_rank(found), [{3: 0, 7: 2, 8: 0}.get(p, 3) for p in range(20)])
+    np.testing.assert_array_equal(
+        np.linalg.matrix_rank(found), [{3: 0, 7: 2, 8: 0}.get(p, 3) for p in range(20)]
+    )
 
 
 def invariants(cameras: jax.Array, points: jax.Array) -> jax.Array:
-    """Numbers that no similarity changes: ratios of distances of points and of cameras, an angle, focal lengths."""
+    """Numbers that no similarity changes: ratios of distances of points and of cameras, an angle,
+    focal lengths."""
     rotation = jnp.moveaxis(rotations.rotation_matrix(cameras[:, :3].T), 2, 0)
     center = lambda at: -rotation[at].T @ cameras[at, 3:6]
     length = lambda x: jnp.sqrt(jnp.sum(x * x))
     base = length(points[0] - points[11])
     turn = rotation[0] @ rotation[3].T
     ratios = length(points[2] - points[5]) / base, length(center(1) - points[4]) / base
-    return jnp.stack([*ratios, length(center(0) - center(3)) / base, turn[0, 1], cameras[4, 6] / 600])
+    return jnp.stack(
+        [*ratios, length(center(0) - center(3)) / base, turn[0, 1], cameras[4, 6] / 600]
+    )
 
 
-PAIRS = [(name, loss) for name in SETTINGS for loss in (("squared", "cauchy") if "lens" in name else ("squared",))]
+PAIRS = [
+    (name, loss)
+    for name in SETTINGS
+    for loss in (("squared", "cauchy") if "lens" in name else ("squared",))
+]
 
 
 @pytest.mark.slow
@@ -256,7 +321,9 @@ def test_derivatives_of_invariants_are_those_of_differences_in_every_setting(nam
     found = jax.grad(value)(inputs)
     change = np.random.default_rng(2).normal(size=inputs.observations.shape)
     # central differences of fourth order
-    at = lambda scale: float(value(inputs._replace(observations=inputs.observations + scale * step * change)))
+    at = lambda scale: float(
+        value(inputs._replace(observations=inputs.observations + scale * step * change))
+    )
     wanted = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
     # a solve ends some sqrt(2 ftol cost) pixels from its minimum
     away = 3 * np.sqrt(2 * TIGHT.tolerances.ftol * solution.final_cost) / step + 1e-7
@@ -270,7 +337,8 @@ def test_with_a_free_gauge_the_solution_moves_at_right_angles_to_its_orbit():
     find = differentiable_solve(problem, "ceres", TIGHT)
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
     found, pull = jax.vjp(find, inputs)
-    # all points and all translations moved by one vector: the derivative of how far along it is zero
+    # all points and all translations moved by one vector: the derivative of how far along it is
+    # zero
     by_translation = -geometry.rotation_matrices(problem.cameras[:, :3]).transpose(2, 0, 1)
     for k in range(3):
         along = np.zeros(problem.cameras.shape)

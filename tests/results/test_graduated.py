@@ -1,4 +1,5 @@
-"""Wrong matches are found and left out, also where images start at wrong places, and the rest ends as without them."""
+"""Wrong matches are found and left out, also where images start at wrong places, and the rest ends
+as without them."""
 
 from __future__ import annotations
 
@@ -9,7 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxba
-from jaxba import BundleProblem, ProblemError, SceneConfig, SolveOptions, random_scene, solve_graduated
+from jaxba import (
+    BundleProblem,
+    ProblemError,
+    SceneConfig,
+    SolveOptions,
+    random_scene,
+    solve_graduated,
+)
 from jaxba.problem import geometry
 
 QUICK = SolveOptions(compilation="quick")
@@ -21,7 +29,9 @@ def scene() -> BundleProblem:
     return random_scene(SceneConfig(cameras=12, points=400, mean_track=6.0, trajectory="orbit"), 1)
 
 
-def with_wrong(problem: BundleProblem, share: float, seed: int = 0) -> tuple[BundleProblem, np.ndarray]:
+def with_wrong(
+    problem: BundleProblem, share: float, seed: int = 0
+) -> tuple[BundleProblem, np.ndarray]:
     """Random pixels in the place of some, and which."""
     rng, pixels = np.random.default_rng(seed), problem.observations
     wrong = rng.random(len(pixels)) < share
@@ -38,13 +48,17 @@ def with_images(problem: BundleProblem, how: str) -> BundleProblem:
         turn = np.diag([-1.0, 1.0, -1.0]) @ turns[image]
         center = centers[image]
         if how == "anywhere":
-            turn, center = Rotation.random(rng=rng).as_matrix(), rng.normal(centers.mean(0), centers.std(0))
+            turn, center = (
+                Rotation.random(rng=rng).as_matrix(),
+                rng.normal(centers.mean(0), centers.std(0)),
+            )
         cameras[image, :6] = *Rotation.from_matrix(turn).as_rotvec(), *(-turn @ center)
     return problem.replace(cameras=cameras)
 
 
 def check(solution: jaxba.Solution, start: BundleProblem, right: np.ndarray) -> None:
-    """Among the right ones that are kept, the cost is that of a solve of them alone from a start without errors."""
+    """Among the right ones that are kept, the cost is that of a solve of them alone from a start
+    without errors."""
     assert solution.converged
     assert solution.rejected is not None
     kept = right & ~solution.rejected
@@ -66,7 +80,8 @@ def test_the_rest_ends_as_without_wrong_matches(how):
     of_lost = np.isin(problem.camera_index, lost)
     assert solution.rejected[of_lost].all()
     right = ~wrong & ~of_lost
-    right &= np.bincount(problem.point_index[right])[problem.point_index] > 1  # else nothing says so
+    # else nothing says so
+    right &= np.bincount(problem.point_index[right])[problem.point_index] > 1
     assert np.mean(solution.rejected[right]) < (0.01 if how == "well" else 0.05)
     np.testing.assert_array_equal(solution.problem.cameras[lost, :6], start.cameras[lost, :6])
     gone = np.setdiff1d(np.arange(problem.num_points), problem.point_index[~solution.rejected])
@@ -93,7 +108,9 @@ def test_other_residuals_keep_their_weight():
 def test_iterations_are_counted_over_all_solves_and_a_callback_ends_them():
     seen = []
     problem = with_images(with_wrong(scene(), 0.3)[0], "turned")
-    solution = solve_graduated(problem, options=QUICK, callback=lambda record: seen.append(record) or len(seen) == 7)
+    solution = solve_graduated(
+        problem, options=QUICK, callback=lambda record: seen.append(record) or len(seen) == 7
+    )
     assert [record.iteration for record in seen] == list(range(1, 8))
     assert solution.iterations == 7
     assert not solution.converged

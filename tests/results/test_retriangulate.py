@@ -1,4 +1,5 @@
-"""The search for points at other depths: it finds what hangs elsewhere, moves nothing else, and never costs more."""
+"""The search for points at other depths: it finds what hangs elsewhere, moves nothing else, and
+never costs more."""
 
 from __future__ import annotations
 
@@ -49,7 +50,9 @@ def test_points_behind_their_cameras_or_far_away_are_found_again(factor):
 
 
 @pytest.mark.parametrize("loss", [Loss(), Loss("cauchy", 2.0)], ids=["squared", "cauchy"])
-@pytest.mark.parametrize("make", [lambda: thrown(1, 3.0), support.odd, support.whitened], ids=["far", "odd", "white"])
+@pytest.mark.parametrize(
+    "make", [lambda: thrown(1, 3.0), support.odd, support.whitened], ids=["far", "odd", "white"]
+)
 def test_no_point_costs_more_and_what_did_not_move_keeps_every_bit(make, loss):
     problem = make()
     found = retriangulate(problem, loss)
@@ -58,7 +61,9 @@ def test_no_point_costs_more_and_what_did_not_move_keeps_every_bit(make, loss):
     assert found.moved == moved.sum()
     assert (after[moved] < before[moved]).all()
     chex.assert_trees_all_equal(found.problem.replace(points=problem.points), problem, strict=True)
-    np.testing.assert_allclose([found.cost_before, found.cost_after], [before.sum(), after.sum()], rtol=1e-9)
+    np.testing.assert_allclose(
+        [found.cost_before, found.cost_after], [before.sum(), after.sum()], rtol=1e-9
+    )
     hidden = lambda p: np.bincount(p.point_index, geometry.depths(p) < 0, minlength=p.num_points)
     assert (hidden(found.problem) <= hidden(problem)).all()
 
@@ -75,7 +80,9 @@ def test_what_is_found_is_a_minimum_of_that_point_alone():
             local = Rotation.from_rotvec(cameras[:, :3]).apply(x) + cameras[:, 3:6]
             return (support.distort(-local[:, :2] / local[:, 2:], cameras[:, 6:]) - pixels).ravel()
 
-        best = least_squares(residual, problem.points[point], method="lm", xtol=1e-14, ftol=1e-14).cost
+        best = least_squares(
+            residual, problem.points[point], method="lm", xtol=1e-14, ftol=1e-14
+        ).cost
         np.testing.assert_allclose(point_costs(problem, Loss())[point], best, rtol=1e-8)
 
 
@@ -136,7 +143,8 @@ STRANDING = solve_options(refinement=Refinement(points=3))
 
 
 def one_diverged() -> BundleProblem:
-    """One point of forty behind its cameras: it drags them along, and such a solve converges far above the minimum."""
+    """One point of forty behind its cameras: it drags them along, and such a solve converges far
+    above the minimum."""
     return strayed(-3.0, every=40)
 
 
@@ -151,8 +159,12 @@ def no_search(_) -> None:
 
 @pytest.mark.slow
 def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
-    np.testing.assert_allclose(solve(one_diverged(), "bold").final_cost, geometry.cost(solved()), rtol=1e-6)
-    assert jaxba.solve(one_diverged(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
+    np.testing.assert_allclose(
+        solve(one_diverged(), "bold").final_cost, geometry.cost(solved()), rtol=1e-6
+    )
+    assert jaxba.solve(one_diverged(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(
+        solved()
+    )
 
 
 @pytest.mark.slow
@@ -206,8 +218,12 @@ def test_a_stop_by_the_callback_ends_all_of_it():
 
 def test_the_search_counts_the_loss_of_the_solve():
     searches, loss = [], Loss("cauchy", 2.0)
-    found = solve_and_retriangulate(support.tiny(), "ceres", solve_options(loss=loss), on_search=searches.append)
-    np.testing.assert_allclose(searches[0].cost_before, point_costs(found.problem, loss).sum(), rtol=1e-9)
+    found = solve_and_retriangulate(
+        support.tiny(), "ceres", solve_options(loss=loss), on_search=searches.append
+    )
+    np.testing.assert_allclose(
+        searches[0].cost_before, point_costs(found.problem, loss).sum(), rtol=1e-9
+    )
     assert searches[0].cost_before < 0.95 * geometry.cost(found.problem)
 
 

@@ -45,7 +45,10 @@ def test_a_writer_killed_midway_leaves_the_old_file_whole(old, tmp_path):
     path = tmp_path / "file"
     if old is not None:
         path.write_bytes(old)
-    assert subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode == -signal.SIGKILL
+    assert (
+        subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode
+        == -signal.SIGKILL
+    )
     assert (path.read_bytes() if path.exists() else None) == old
     (left,) = set(tmp_path.iterdir()) - {path}
     assert left.match(TEMPORARY.format("*"))

@@ -1,4 +1,5 @@
-"""Programs compiled at lower levels: they compute the same, are replaced by optimised ones, and can be switched off."""
+"""Programs compiled at lower levels: they compute the same, are replaced by optimised ones, and can
+be switched off."""
 
 from __future__ import annotations
 
@@ -40,7 +41,11 @@ on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_more_observations_mean_fewer_quick_iterations(kind):
     even, typical = BREAK_EVEN[kind], TYPICAL[kind]
-    assert [quick_iterations(kind, count) for count in (1, 100, even // typical)] == [even, even // 100, typical]
+    assert [quick_iterations(kind, count) for count in (1, 100, even // typical)] == [
+        even,
+        even // 100,
+        typical,
+    ]
     assert quick_iterations(kind, even // (typical - 1)) == quick_iterations(kind, 10**9) == 0
     assert quick_iterations(kind, 31_843) > 12, "Ladybug-49 converges before that"
 
@@ -67,7 +72,11 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
     quick = solve(support.tiny(), **how, max_iterations=8, compilation="quick")
     assert full.quick_iterations == 0
     assert quick.quick_iterations == (quick.iterations if compiler_options("quick") else 0)
-    assert (quick.iterations, quick.accepted, quick.termination) == (full.iterations, full.accepted, full.termination)
+    assert (quick.iterations, quick.accepted, quick.termination) == (
+        full.iterations,
+        full.accepted,
+        full.termination,
+    )
     np.testing.assert_allclose(quick.history.cost, full.history.cost, rtol=1e-8)
     # Ceres' rule sees the last digits of a decrease
     np.testing.assert_allclose(quick.history.damping, full.history.damping, rtol=1e-4)
@@ -112,15 +121,28 @@ def test_the_two_parts_are_the_step():
 @pytest.mark.parametrize("level", ["quick"])
 def test_candidates_one_by_one_are_those_of_the_loop(level):
     layout, state = support.start(support.tiny())
-    options = StepOptions(refinement=Refinement(points=3, camera_rounds=3, trials=4, pattern_moves=1))
+    options = StepOptions(
+        refinement=Refinement(points=3, camera_rounds=3, trials=4, pattern_moves=1)
+    )
     seen = set()
     for damping in (1e-9, 1e-6, 1e-2):
         proposal = propose(layout, state, jax.numpy.asarray(damping), options)
         for length in (1.0, 30.0, -1.0, np.nan):  # a good step, one too long, one uphill and none
-            step = proposal.step._replace(cameras=length * proposal.step.cameras, points=length * proposal.step.points)
-            given = (layout, state, jax.numpy.asarray(damping), proposal._replace(step=step), options)
+            step = proposal.step._replace(
+                cameras=length * proposal.step.cameras, points=length * proposal.step.points
+            )
+            given = (
+                layout,
+                state,
+                jax.numpy.asarray(damping),
+                proposal._replace(step=step),
+                options,
+            )
             call = lambda function, *arguments: function(*arguments)
-            part = lambda function, *arguments: (program(function, "options", level=level), *arguments)
+            part = lambda function, *arguments: (
+                program(function, "options", level=level),
+                *arguments,
+            )
             parts = try_step_by_parts(call, part, *given, np.asarray(0.0))
             whole = jax.jit(try_step, static_argnums=4)(*given)
             chex.assert_trees_all_close(parts, whole, rtol=1e-7, atol=1e-10)
@@ -215,7 +237,9 @@ def test_a_second_quick_solve_compiles_nothing_and_each_level_has_its_program():
 
 
 def test_a_callback_stops_a_quick_solve():
-    stopped = solve(support.tiny(), "ceres", compilation="quick", callback=lambda record: record.iteration == 2)
+    stopped = solve(
+        support.tiny(), "ceres", compilation="quick", callback=lambda record: record.iteration == 2
+    )
     assert stopped.termination == Termination.STOPPED
     assert stopped.iterations == 2
 
@@ -235,13 +259,19 @@ def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
 @pytest.mark.parametrize("unknown_first", [True, False])
 def test_an_unknown_option_leaves_those_that_are_known(unknown_first, monkeypatch):
     known = {"xla_backend_optimization_level": 0}
-    options = {"xla_no_such_option": True, **known} if unknown_first else {**known, "xla_no_such_option": True}
+    options = (
+        {"xla_no_such_option": True, **known}
+        if unknown_first
+        else {**known, "xla_no_such_option": True}
+    )
     monkeypatch.setattr("jaxba.runtime.jit.QUICK", options)
     assert quick_options.__wrapped__() == known
 
 
 def test_an_unknown_choice_is_refused_in_one_line(unchecked):
-    with pytest.raises(ValueError, match="compilation must be one of full, quick, auto, not 'fast'"):
+    with pytest.raises(
+        ValueError, match="compilation must be one of full, quick, auto, not 'fast'"
+    ):
         solve(support.tiny(), compilation="fast")
 
 
@@ -257,4 +287,7 @@ def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkey
     assert "quickly" not in capsys.readouterr().out
     monkeypatch.setattr("jaxba.solver.stepwise.quick_iterations", lambda kind, _: 1)
     assert run(fast) == 0
-    assert " (1 of them with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
+    assert (
+        " (1 of them with quickly compiled programs, see --compilation)\n"
+        in capsys.readouterr().out
+    )

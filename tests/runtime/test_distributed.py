@@ -1,4 +1,5 @@
-"""Bad input to the start of several processes and devices. Training and solves have the tests with two of them."""
+"""Bad input to the start of several processes and devices. Training and solves have the tests with
+two of them."""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ def test_a_port_that_is_taken_is_named():
 
 def test_more_devices_than_there_are_and_none_are_one_line():
     count = len(jax.local_devices())
-    with pytest.raises(InputError, match=rf"{count + 1} devices asked for, {count} of kind \w+ found"):
+    with pytest.raises(
+        InputError, match=rf"{count + 1} devices asked for, {count} of kind \w+ found"
+    ):
         distributed.use_devices(count + 1)
     with pytest.raises(InputError, match="at least one device is needed, not 0"):
         distributed.use_devices(0)

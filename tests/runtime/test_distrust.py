@@ -1,4 +1,5 @@
-"""Compiled programs that XLA distrusts are noticed once, and compiled for fewer instructions from then on."""
+"""Compiled programs that XLA distrusts are noticed once, and compiled for fewer instructions from
+then on."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ def flags(folder):
 
 
 @pytest.mark.parametrize("distrusted", [False, True])
-def test_a_refusal_is_said_once_and_limits_the_next_process(distrusted, tmp_path, capfd, monkeypatch):
+def test_a_refusal_is_said_once_and_limits_the_next_process(
+    distrusted, tmp_path, capfd, monkeypatch
+):
     monkeypatch.setattr(distrust, "are_distrusted", lambda _: distrusted)
     for _ in range(2):
         monkeypatch.setenv("XLA_FLAGS", "--xla_dump_max_hlo_modules=7")
@@ -55,6 +58,7 @@ COMPLAINT = distrust.COMPLAINT.decode()
 def test_another_processor_has_another_folder(tmp_path, monkeypatch):
     here = programs_folder(tmp_path)
     assert programs_folder(tmp_path) == here
-    monkeypatch.setattr(distrust.Path, "is_file", lambda _: False)  # a system that tells no instructions
+    # a system that tells no instructions
+    monkeypatch.setattr(distrust.Path, "is_file", lambda _: False)
     monkeypatch.setattr(distrust.platform, "node", lambda: "another")
     assert programs_folder(tmp_path) not in (here, tmp_path)

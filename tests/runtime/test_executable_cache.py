@@ -1,4 +1,5 @@
-"""Compiled programs on disk: a later process finds them, runs the same ones, and confuses none with another."""
+"""Compiled programs on disk: a later process finds them, runs the same ones, and confuses none with
+another."""
 
 from __future__ import annotations
 
@@ -126,9 +127,15 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
 
 
 @pytest.mark.slow
-def test_a_second_solve_in_parts_reads_its_programs_and_repeats_itself_bit_by_bit(folder, monkeypatch):
+def test_a_second_solve_in_parts_reads_its_programs_and_repeats_itself_bit_by_bit(
+    folder, monkeypatch
+):
     problem = support.tiny()
-    for name, value in (("LARGE", 1), ("PART", problem.num_observations // 3), ("PART_OF_CAMERA", 0)):
+    for name, value in (
+        ("LARGE", 1),
+        ("PART", problem.num_observations // 3),
+        ("PART_OF_CAMERA", 0),
+    ):
         monkeypatch.setattr(sharded, name, value)
     first = solve(problem, "ceres", linear_solver="implicit", max_iterations=3)
     assert [path.name.partition("-")[0] for path in kept(folder)] == ["_begin", "_run"]
@@ -164,7 +171,9 @@ def test_a_problem_that_shares_some_programs_compiles_each_other_one_once(folder
     forget()
     with Compilations() as seen:
         once(support.paper(1))
-    compiled = [name for name in seen.names if name in ("begin", "_advance_and_pack", "propose", "try_step")]
+    compiled = [
+        name for name in seen.names if name in ("begin", "_advance_and_pack", "propose", "try_step")
+    ]
     assert sorted(compiled) == ["propose", "try_step"]
 
 
@@ -182,9 +191,12 @@ COUNTING = """
 import sys
 from jax import monitoring
 names = []
-monitoring.register_event_duration_secs_listener(
-    lambda event, _, **facts: names.append(facts.get("fun_name")) if "compile/jaxpr_trace" in event else None
-)
+
+def listen(event, _, **facts):
+    if "compile/jaxpr_trace" in event:
+        names.append(facts.get("fun_name"))
+
+monitoring.register_event_duration_secs_listener(listen)
 from jaxba.cli.solve import run
 status = run(sys.argv[1:])
 print("traced", sum(str(name) in ("propose", "try_candidate") for name in names))
@@ -196,7 +208,9 @@ def test_what_a_solve_ran_quickly_compiled_is_fully_optimised_in_the_next(folder
     """Another process compiles it after the solve; the second solve differs by rounding alone."""
     monkeypatch.setattr(stepwise, "WORTH_S", 0.0)
     problem = support.tiny()
-    once = lambda: solve(problem, "ceres", max_iterations=4, compilation="auto", tolerances=Tolerances(ftol=0))
+    once = lambda: solve(
+        problem, "ceres", max_iterations=4, compilation="auto", tolerances=Tolerances(ftol=0)
+    )
     first = once()
     assert first.quick_iterations == 4
     before, limit = len(kept(folder)), time.monotonic() + 60
@@ -219,17 +233,30 @@ def test_a_second_call_of_the_command_traces_no_step_and_writes_the_same_file(tm
     ends = []
     for turn in range(2):
         output = tmp_path / f"{turn}.txt"
-        command = [sys.executable, "-c", COUNTING, str(problem), "--output", str(output), "--compilation", "quick"]
+        command = [
+            sys.executable,
+            "-c",
+            COUNTING,
+            str(problem),
+            "--output",
+            str(output),
+            "--compilation",
+            "quick",
+        ]
         environment = {**os.environ, "JAXBA_CACHE": str(folder)}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-        printed = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+        printed = subprocess.run(
+            command, env=environment, check=True, capture_output=True, text=True
+        ).stdout
         ends.append((printed.splitlines()[-1], output.read_bytes()))
     assert ends[0][0] != "traced 0"
     assert ends[1][0] == "traced 0"
     assert ends[0][1] == ends[1][1]
 
 
-@pytest.mark.parametrize("content", [b"", b"no program", None], ids=["empty", "something else", "cut off"])
+@pytest.mark.parametrize(
+    "content", [b"", b"no program", None], ids=["empty", "something else", "cut off"]
+)
 def test_a_damaged_file_is_compiled_and_written_again(content, folder):
     x = jnp.arange(3.0)
     expected = np.asarray(call(x))
@@ -251,7 +278,9 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
     layout, _ = support.start(support.tiny())
     fewer = dataclasses.replace(layout, buckets=layout.buckets[1:])
     learned = make_policy("learned")
-    stricter = dataclasses.replace(learned, config=dataclasses.replace(learned.config, min_gain=0.2))
+    stricter = dataclasses.replace(
+        learned, config=dataclasses.replace(learned.config, min_gain=0.2)
+    )
     others = [
         cache.path_for(try_step, {"power": 1}, (x,)),
         *(cache.path_for(double, {}, (tree,)) for tree in (layout, fewer, learned, stricter)),
@@ -289,7 +318,17 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
         (call, {"power": 1}, 1.0),
         (lambda x: x, {}, 1.0),
     ],
-    ids=["builtin", "lambda", "class", "inside", "loss", "tree", "in a tree", "function", "nameless"],
+    ids=[
+        "builtin",
+        "lambda",
+        "class",
+        "inside",
+        "loss",
+        "tree",
+        "in a tree",
+        "function",
+        "nameless",
+    ],
 )
 def test_programs_with_code_of_other_packages_are_not_stored(function, static, argument, folder):
     assert executable_cache.ExecutableCache(folder).path_for(function, static, (argument,)) is None
@@ -316,7 +355,9 @@ def test_a_users_residual_is_known_by_what_it_does(folder):
 
     known = [jitted(scale).residuals.rows[0].residual.source for scale in (1.0, 1.0, 2.0)]
     assert known[0] == known[1] != known[2]
-    path = lambda scale: executable_cache.ExecutableCache(folder).path_for(try_step, {}, (registered(scale).residuals,))
+    path = lambda scale: executable_cache.ExecutableCache(folder).path_for(
+        try_step, {}, (registered(scale).residuals,)
+    )
     assert path(1.0) is not None
     assert path(1.0) == path(1.0) != path(2.0)
     unregistered = jaxba.residual(lambda point, *, at: point - at)(point=[0], at=0.0)
@@ -332,12 +373,16 @@ def test_two_rules_of_a_user_are_not_confused(folder):
                 return state, factor * step.damping
 
         base = make_policy("constant:1e-3")
-        return Constant(**{field.name: getattr(base, field.name) for field in dataclasses.fields(base)})
+        return Constant(
+            **{field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
+        )
 
     for factor in (0.5, 2.0):
         forget()
         solved = solve(support.tiny(), rule(factor), max_iterations=3, callback=lambda record: None)
-        np.testing.assert_allclose(solved.history.damping[1:] / solved.history.damping[:-1], factor, rtol=1e-12)
+        np.testing.assert_allclose(
+            solved.history.damping[1:] / solved.history.damping[:-1], factor, rtol=1e-12
+        )
     names = {file.name.partition("-")[0] for file in kept(folder)}
     assert {"propose", "try_step"} <= names
     assert not {"begin", "_advance_and_pack"} & names
@@ -362,12 +407,15 @@ def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
     use_cache_of_jax(str(tmp_path / "of-jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     hits = []
-    listen = lambda event, **_: hits.append(event) if event == "/jax/compilation_cache/cache_hits" else None
+    listen = lambda event, **_: (
+        hits.append(event) if event == "/jax/compilation_cache/cache_hits" else None
+    )
     monitoring.register_event_listener(listen)
     try:
         call(jnp.arange(3.0))
         jax.config.update("jax_compilation_cache_dir", None)  # what it has opened stays open
-        for _ in range(2):  # the folder's name is part of the key of some versions of JAX: then the first is compiled
+        # the folder's name is part of the key of some versions of JAX: then the first is compiled
+        for _ in range(2):
             forget()
             for file in kept(folder):
                 file.unlink()
@@ -430,6 +478,8 @@ def test_a_static_argument_may_stand_anywhere(folder):
         with ParallelCompilation() as compile_programs:
             out = compile_programs(function, jnp.arange(3.0), 2, jnp.ones(3))
         assert (out.shape, out.dtype) == ((3,), jnp.float64)
-        np.testing.assert_array_equal(compile_programs.run(function, jnp.arange(3.0), 2, jnp.ones(3)), [1, 2, 5])
+        np.testing.assert_array_equal(
+            compile_programs.run(function, jnp.arange(3.0), 2, jnp.ones(3)), [1, 2, 5]
+        )
         forget()
     assert len(kept(folder)) == 1

@@ -9,15 +9,25 @@ import numpy as np
 import pytest
 from absl.testing import parameterized
 
-from jaxba.runtime.fusion import compute_in_one_loop, compute_unfused, computed_after, fast_compilation, fusion_barrier
+from jaxba.runtime.fusion import (
+    compute_in_one_loop,
+    compute_unfused,
+    computed_after,
+    fast_compilation,
+    fusion_barrier,
+)
 
 
 def rows(dtype=np.float64) -> np.ndarray:
     """Every magnitude that has no subnormal numbers in it, both signs, and zero."""
     rng = np.random.default_rng(0)
     limits = np.finfo(dtype)
-    exponent = rng.uniform(np.log2(float(limits.tiny)), np.log2(float(limits.max)) - 1, size=(12, 50))
-    values = (rng.choice([-1, 1], size=exponent.shape) * rng.uniform(1, 2, exponent.shape)).astype(dtype)
+    exponent = rng.uniform(
+        np.log2(float(limits.tiny)), np.log2(float(limits.max)) - 1, size=(12, 50)
+    )
+    values = (rng.choice([-1, 1], size=exponent.shape) * rng.uniform(1, 2, exponent.shape)).astype(
+        dtype
+    )
     values = np.ldexp(values, np.floor(exponent).astype(int))
     values[3, 7] = 0
     return values
@@ -37,7 +47,9 @@ class JittedAndNot(chex.TestCase):
     @chex.variants(with_jit=True, without_jit=True)
     def test_unfused_computation_changes_no_bit(self):
         x, y = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4))), jnp.asarray(0.5)
-        found = self.variant(lambda x, y, index: compute_unfused(squares, x, y, index=index))(x, y, INDEX)
+        found = self.variant(lambda x, y, index: compute_unfused(squares, x, y, index=index))(
+            x, y, INDEX
+        )
         assert np.array_equal(found, squares(x, y))
 
 
@@ -45,7 +57,10 @@ def test_a_barrier_maps_over_a_batch():
     batch = np.stack([rows(), -rows(), 0 * rows()])
     assert np.array_equal(jax.jit(jax.vmap(fusion_barrier))(batch), batch)
     assert np.array_equal(
-        jax.jit(jax.vmap(fusion_barrier, in_axes=1, out_axes=1))(batch.swapaxes(0, 1)).swapaxes(0, 1), batch
+        jax.jit(jax.vmap(fusion_barrier, in_axes=1, out_axes=1))(batch.swapaxes(0, 1)).swapaxes(
+            0, 1
+        ),
+        batch,
     )
 
 
@@ -84,7 +99,9 @@ def test_unfused_computation_maps_over_a_batch():
 
 def test_derivatives_pass_unfused_computation():
     x, y = np.random.default_rng(0).normal(size=(5, 4)), jnp.asarray(0.5)
-    there = jax.jit(jax.grad(lambda x, index: jnp.sum(compute_unfused(squares, x, y, index=index) ** 2)))(x, INDEX)
+    there = jax.jit(
+        jax.grad(lambda x, index: jnp.sum(compute_unfused(squares, x, y, index=index) ** 2))
+    )(x, INDEX)
     here = jax.grad(lambda x: jnp.sum(squares(x, y) ** 2))(jnp.asarray(x))
     np.testing.assert_allclose(there, here, rtol=1e-13)
 
@@ -119,7 +136,11 @@ def vectors(pair, scale, mask):
 
 def given(dtype=np.float64, n=37):
     rng = np.random.default_rng(0)
-    return jnp.asarray(rng.normal(size=(2, n)), dtype), jnp.asarray(rng.normal(size=n), dtype), rng.random(n) < 0.8
+    return (
+        jnp.asarray(rng.normal(size=(2, n)), dtype),
+        jnp.asarray(rng.normal(size=n), dtype),
+        rng.random(n) < 0.8,
+    )
 
 
 @pytest.mark.parametrize("fast", [False, True], ids=["optimised", "fast"])
@@ -130,11 +151,14 @@ def test_each_vector_is_what_it_is_in_a_loop_of_its_own(dtype, fast):
         found = jax.jit(lambda *x: compute_in_one_loop(vectors, *x))(*operands)
     for row, truth in zip(found, jax.jit(vectors)(*operands), strict=True):
         assert row.dtype == dtype
-        np.testing.assert_allclose(row, truth, rtol=4 * np.finfo(dtype).eps, atol=np.finfo(dtype).eps)
+        np.testing.assert_allclose(
+            row, truth, rtol=4 * np.finfo(dtype).eps, atol=np.finfo(dtype).eps
+        )
 
 
 def test_numbers_that_are_not_finite_stay_in_their_vector():
-    """The half of the loop that is dropped must not spoil the other: nothing is multiplied by zero."""
+    """The half of the loop that is dropped must not spoil the other: nothing is multiplied by
+    zero."""
     x = jnp.asarray([1.0, np.nan, np.inf, -np.inf, 0.0])
     first, second = jax.jit(lambda x: compute_in_one_loop(lambda x: [x, 1 / x], x))(x)
     np.testing.assert_array_equal(first, x)
@@ -152,16 +176,24 @@ def test_one_loop_maps_over_a_batch():
 
 def test_derivatives_pass_through_one_loop():
     pair, scale, mask = given()
-    both = lambda make: lambda pair: sum(jnp.sum(row**2) for row in make(vectors, pair, scale, mask))
+    both = lambda make: (
+        lambda pair: sum(jnp.sum(row**2) for row in make(vectors, pair, scale, mask))
+    )
     ours, truth = both(compute_in_one_loop), both(lambda function, *operands: function(*operands))
-    np.testing.assert_allclose(jax.jit(jax.grad(ours))(pair), jax.grad(truth)(pair), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(jax.jvp(ours, (pair,), (pair,))[1], jax.jvp(truth, (pair,), (pair,))[1], rtol=1e-12)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(ours))(pair), jax.grad(truth)(pair), rtol=1e-12, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        jax.jvp(ours, (pair,), (pair,))[1], jax.jvp(truth, (pair,), (pair,))[1], rtol=1e-12
+    )
 
 
 def test_trees_of_vectors_are_taken_as_operands():
     pair, scale, mask = given()
     found = compute_in_one_loop(
-        lambda tree, mask: vectors(tree["pair"], tree["scale"], mask), {"pair": list(pair), "scale": scale}, mask
+        lambda tree, mask: vectors(tree["pair"], tree["scale"], mask),
+        {"pair": list(pair), "scale": scale},
+        mask,
     )
     for row, truth in zip(found, vectors(pair, scale, mask), strict=True):
         np.testing.assert_allclose(row, truth, rtol=1e-14, atol=1e-15)
@@ -170,13 +202,14 @@ def test_trees_of_vectors_are_taken_as_operands():
 @pytest.mark.xla
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_many_vectors_come_out_of_one_loop():
-    """As a reduction with as many results as there are vectors; one by one each has its own loop."""
+    """As a reduction with as many results as there are vectors; one by one each has its own
+    loop."""
 
     def results(fast: bool) -> list[int]:
         with fast_compilation(fast):
-            lowered = jax.jit(lambda x, y: compute_in_one_loop(lambda x, y: [x * y + k for k in range(9)], x, y)).lower(
-                *given()[0]
-            )
+            lowered = jax.jit(
+                lambda x, y: compute_in_one_loop(lambda x, y: [x * y + k for k in range(9)], x, y)
+            ).lower(*given()[0])
         text = lowered.compile().as_text()
         entry = text[text.index("ENTRY") :].splitlines()
         return [line.split(" fusion(")[0].count("f64[") for line in entry if " fusion(" in line]
@@ -204,5 +237,10 @@ def test_fast_compilation_is_traced_anew():
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_a_single_vector_is_no_sum():
     """XLA hands a sum of one operand to a library, with its operand stored for both halves."""
-    text = jax.jit(lambda x: compute_in_one_loop(lambda x: [x * x + 1], x)).lower(given()[1]).compile().as_text()
+    text = (
+        jax.jit(lambda x: compute_in_one_loop(lambda x: [x * x + 1], x))
+        .lower(given()[1])
+        .compile()
+        .as_text()
+    )
     assert "reduce(" not in text

@@ -17,7 +17,16 @@ from jax._src import compiler
 from tiny_game import tiny_game
 
 import jaxba
-from jaxba import Loss, SolveOptions, covariance, differentiable_solve, hold, inputs_of, solve, solve_and_retriangulate
+from jaxba import (
+    Loss,
+    SolveOptions,
+    covariance,
+    differentiable_solve,
+    hold,
+    inputs_of,
+    solve,
+    solve_and_retriangulate,
+)
 from jaxba.game.gym import GymVectorGame
 from jaxba.runtime.jit import RIGHT, jit, known_options, right_options
 from jaxba.training.sac import SacConfig
@@ -26,8 +35,8 @@ from jaxba.training.train_loop import LoopConfig, run_chunk, start
 on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="YNNPACK is of CPUs")
 
 WRONG = ("0.10.2",)
-"""Versions of jaxlib that compute `squares` wrongly. Where none of those that jaxba runs on is among them, and none
-crashes (jax-ml/jax#39257), `jaxba.runtime.jit` can go."""
+"""Versions of jaxlib that compute `squares` wrongly. Where none of those that jaxba runs on is
+among them, and none crashes (jax-ml/jax#39257), `jaxba.runtime.jit` can go."""
 
 OWN_OPTIONS = {"runtime/jit.py", "runtime/compilation.py"}
 """Files that may say `jax.jit`: they give the options themselves."""
@@ -50,7 +59,8 @@ def is_right(result, rows):
 
 @on_a_cpu
 def test_what_xla_compiles_wrongly_is_right_in_a_program_of_ours(rows):
-    # the control: where this fails, a version is right or wrong that was not, and `WRONG` is to be changed
+    # the control: where this fails, a version is right or wrong that was not, and `WRONG` is to be
+    # changed
     assert is_right(jax.jit(squares)(rows), rows) == (jaxlib.__version__ not in WRONG)
     assert is_right(jit(squares)(rows), rows)
     inner = jit(lambda x: 2 * squares(x))
@@ -64,7 +74,9 @@ def test_it_is_called_inside_other_programs_and_transformations():
     for call in (cube, jax.jit(cube), jax.vmap(cube), jit(cube), lambda x: jax.lax.map(cube, x)):
         np.testing.assert_array_equal(call(x), wanted)
     np.testing.assert_array_equal(jax.jacfwd(cube)(x), np.diag(3 * np.square(x)))
-    np.testing.assert_array_equal(jax.grad(lambda x: jnp.sum(cube(x, power=3)))(x), 3 * np.square(x))
+    np.testing.assert_array_equal(
+        jax.grad(lambda x: jnp.sum(cube(x, power=3)))(x), 3 * np.square(x)
+    )
     np.testing.assert_array_equal(cube.lower(x, power=2).compile()(x), np.square(x))
 
 
@@ -76,7 +88,9 @@ def test_no_module_compiles_without_the_options():
             of_jax = isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "jax"
             name = node.attr if of_jax else ""
             if isinstance(node, ast.ImportFrom) and node.module == "jax":
-                name = next((alias.name for alias in node.names if alias.name in ("jit", "pmap")), "")
+                name = next(
+                    (alias.name for alias in node.names if alias.name in ("jit", "pmap")), ""
+                )
             if name in ("jit", "pmap"):
                 found.add(file.relative_to(folder).as_posix())
     assert found == OWN_OPTIONS
@@ -88,7 +102,8 @@ def test_an_option_that_a_jaxlib_does_not_know_is_left_out():
 
 @pytest.fixture
 def fused(monkeypatch):
-    """Names of the programs with a fusion for YNNPACK that are compiled, or read from JAX's cache, meanwhile."""
+    """Names of the programs with a fusion for YNNPACK that are compiled, or read from JAX's cache,
+    meanwhile."""
     found, compile_one = [], compiler.compile_or_get_cached
 
     def watch(*arguments, **named):
@@ -122,7 +137,10 @@ def play():
 
 
 def learn():
-    sac, loop = SacConfig(width=16, batch=64), LoopConfig(replay_capacity=300, updates_per_step=2, steps_per_chunk=2)
+    sac, loop = (
+        SacConfig(width=16, batch=64),
+        LoopConfig(replay_capacity=300, updates_per_step=2, steps_per_chunk=2),
+    )
     run_chunk(sac, loop, toys.ACTION, start(sac, loop, toys.ACTION, jax.random.key(0)))
 
 
@@ -137,7 +155,9 @@ def learn():
         lambda: solved(policy="ceres", method="stba", compilation="full"),
         lambda: solved(policy="ceres", method="deeplm", compilation="full"),
         lambda: solve(support.odd(), "ceres", SolveOptions(max_iterations=1)),
-        lambda: solve(support.whitened(), "ceres", SolveOptions(loss=Loss("huber", 1.0), max_iterations=1)),
+        lambda: solve(
+            support.whitened(), "ceres", SolveOptions(loss=Loss("huber", 1.0), max_iterations=1)
+        ),
         lambda: solve_and_retriangulate(support.tiny(), "ceres", SolveOptions(max_iterations=1)),
         lambda: covariance(hold(support.tiny(), poses=[0, 1])),
         gradient,

@@ -44,7 +44,11 @@ def numbers() -> list[np.ndarray]:
     """What the public functions of a problem find."""
     solution = jaxba.solve(GAUGED, "ceres", OPTIONS)
     searched = jaxba.retriangulate(GAUGED)
-    return [solution.problem.cameras, jaxba.covariance(GAUGED).poses, np.asarray(searched.cost_after)]
+    return [
+        solution.problem.cameras,
+        jaxba.covariance(GAUGED).poses,
+        np.asarray(searched.cost_after),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +67,9 @@ def test_the_settings_of_the_program_around_change_no_result(name, expected):
 @pytest.mark.parametrize("name", ["strict promotion of types", "no promotion of ranks"])
 def test_a_step_can_be_traced_under_the_settings_of_the_program_around(name):
     prepared = jaxba.prepare(GAUGED, "ceres", OPTIONS)
-    cost = lambda damping: jaxba.lm_step(prepared.layout, prepared.state, damping, prepared.options)[0].cost
+    cost = lambda damping: (
+        jaxba.lm_step(prepared.layout, prepared.state, damping, prepared.options)[0].cost
+    )
     with SURROUNDINGS[name]():
         shape = jax.eval_shape(cost, DAMPINGS[0])
     assert shape.dtype == np.float64
@@ -80,7 +86,9 @@ def test_a_step_can_be_traced_under_the_settings_of_the_program_around(name):
         lambda q: jaxba.retriangulate(q).cost_after,
         lambda q: jaxba.differentiable_solve(q)(jaxba.inputs_of(q))[0].sum(),
         lambda q: (
-            jaxba.BundleProblem.create(q.cameras, q.points, q.observations, q.camera_index, q.point_index).num_points
+            jaxba.BundleProblem.create(
+                q.cameras, q.points, q.observations, q.camera_index, q.point_index
+            ).num_points
         ),
     ],
 )
@@ -88,7 +96,9 @@ def test_a_call_that_jax_traces_names_what_to_use_instead(call, transform):
     with pytest.raises(
         TypeError, match=r"JAX traces this call .*solve_loop .*prepare .*differentiable_solve"
     ) as caught:
-        transform(lambda pixels: call(GAUGED.replace(observations=pixels)))(jnp.asarray(GAUGED.observations))
+        transform(lambda pixels: call(GAUGED.replace(observations=pixels)))(
+            jnp.asarray(GAUGED.observations)
+        )
     assert "\n" not in str(caught.value)
 
 
@@ -151,7 +161,9 @@ def test_a_forked_process_is_told_at_once_to_begin_anew():
 
 
 def blas_threads() -> list[int]:
-    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+    return [
+        library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+    ]
 
 
 def test_contexts_that_overlap_give_blas_its_threads_back():

@@ -1,4 +1,5 @@
-"""A program over parts gives what `jax.vmap` with an axis name gives, and keeps one part in memory at a time."""
+"""A program over parts gives what `jax.vmap` with an axis name gives, and keeps one part in memory
+at a time."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ def compare(function, divided, outputs, *arguments):
     axes = lambda flags: jax.tree.map(lambda one: 0 if one else None, flags)
     batched = jax.vmap(function, axes(divided), axes(outputs), axis_name="parts")
     in_parts = jax.jit(lambda *given: in_turns(function, "parts", given, divided, outputs))
-    for found, wanted in zip(jax.tree.leaves(in_parts(*arguments)), jax.tree.leaves(batched(*arguments)), strict=True):
+    for found, wanted in zip(
+        jax.tree.leaves(in_parts(*arguments)), jax.tree.leaves(batched(*arguments)), strict=True
+    ):
         np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
 
 
@@ -32,7 +35,12 @@ def test_sums_of_sums_maxima_and_divided_results_are_those_of_a_batch(rows):
     def function(x, y):
         scaled = kept(jnp.sin(x) * y)
         total, greatest = lax.psum((scaled.sum(), x), "parts"), lax.pmax(scaled.max(), "parts")
-        return total[0] * greatest, lax.psum(scaled * greatest, "parts"), scaled + total[1], lax.psum(y, "parts")
+        return (
+            total[0] * greatest,
+            lax.psum(scaled * greatest, "parts"),
+            scaled + total[1],
+            lax.psum(y, "parts"),
+        )
 
     compare(function, (True, False), (False, False, True, False), rows, jnp.asarray(2.0))
 
@@ -45,10 +53,14 @@ def test_loops_whose_state_is_divided_in_part_and_conditions_are_those_of_a_batc
             return jnp.where(count > 1, values * 0.5, values) + change, jnp.abs(change), count + 1
 
         start = x * 2, jnp.asarray(np.inf), jnp.asarray(0)
-        values, change, count = loops.while_loop(lambda now: (now[1] > tolerance) & (now[2] < 20), body, start)
+        values, change, count = loops.while_loop(
+            lambda now: (now[1] > tolerance) & (now[2] < 20), body, start
+        )
         squares = lambda: lax.psum(jnp.sum(values**2), "parts")
         inner = lax.cond(count > 3, squares, lambda: change)
-        refined = loops.run_if(count > 2, lambda y: y + lax.psum(y.sum(), "parts"), (values,), values)
+        refined = loops.run_if(
+            count > 2, lambda y: y + lax.psum(y.sum(), "parts"), (values,), values
+        )
         return values, count, inner, refined
 
     compare(function, (True, False), (True, False, False, True), rows, jnp.asarray(1e-3))
@@ -56,7 +68,9 @@ def test_loops_whose_state_is_divided_in_part_and_conditions_are_those_of_a_batc
 
 def test_loops_and_conditions_of_a_single_part_are_its_own(rows):
     def function(x):
-        root = lax.while_loop(lambda y: jnp.abs(y * y - x[0] ** 2) > 1e-12, lambda y: (y + x[0] ** 2 / y) / 2, 1.0)
+        root = lax.while_loop(
+            lambda y: jnp.abs(y * y - x[0] ** 2) > 1e-12, lambda y: (y + x[0] ** 2 / y) / 2, 1.0
+        )
         signed = lax.cond(x[0] > 0, lambda: root, lambda: -root)
         return signed, lax.psum(signed, "parts")
 
@@ -74,10 +88,15 @@ def test_memory_is_that_of_one_part():
     def function(x):
         wide = jnp.sin(jnp.outer(jnp.arange(1.0, width), x))
         product = lambda y: lax.psum(wide @ (wide.T @ y), "parts")
-        return loops.fori_loop(0, 3, lambda _, y: product(y) / jnp.linalg.norm(y), jnp.ones(width - 1))
+        return loops.fori_loop(
+            0, 3, lambda _, y: product(y) / jnp.linalg.norm(y), jnp.ones(width - 1)
+        )
 
     x = jnp.zeros((parts, size))
-    program = jax.jit(lambda x: in_turns(function, "parts", (x,), (True,), False)).lower(x).compile()
+    program = (
+        jax.jit(lambda x: in_turns(function, "parts", (x,), (True,), False)).lower(x).compile()
+    )
     memory = program.memory_analysis()
     assert memory is not None
-    assert memory.temp_size_in_bytes < 4 * width * size * x.itemsize  # of all parts it would be 64 times as much
+    # of all parts it would be 64 times as much
+    assert memory.temp_size_in_bytes < 4 * width * size * x.itemsize

@@ -13,7 +13,9 @@ from support import solve, tiny
 
 from jaxba.runtime import process
 
-linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux reports the mappings of a process")
+linux = pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="only Linux reports the mappings of a process"
+)
 
 
 def mappings() -> int:

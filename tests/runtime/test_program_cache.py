@@ -65,13 +65,18 @@ MAPPER = """
 import pycolmap
 from jax import monitoring
 traced = []
-monitoring.register_event_duration_secs_listener(
-    lambda event, _, **facts: traced.append(facts.get("fun_name")) if "compile/jaxpr_trace" in event else None
-)
+
+def listen(event, _, **facts):
+    if "compile/jaxpr_trace" in event:
+        traced.append(facts.get("fun_name"))
+
+monitoring.register_event_duration_secs_listener(listen)
 import jaxba
 pycolmap.set_random_seed(0)
 options = pycolmap.SyntheticDatasetOptions()
-options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, {images}, 60
+options.num_rigs = options.num_cameras_per_rig = 1
+options.num_frames_per_rig = {images}
+options.num_points3D = 60
 reconstruction = pycolmap.synthesize_dataset(options)
 noise = pycolmap.SyntheticNoiseOptions()
 noise.point2D_stddev = 0.5
@@ -90,7 +95,9 @@ def test_another_process_with_a_model_of_another_size_compiles_nothing(tmp_path)
     ends = []
     for images in (5, 7):
         command = [sys.executable, "-c", MAPPER.format(images=images)]
-        printed = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+        printed = subprocess.run(
+            command, env=environment, check=True, capture_output=True, text=True
+        ).stdout
         ends.append(printed.splitlines()[-1])
     assert ends[0] != "traced 0"
     assert ends[1] == "traced 0"

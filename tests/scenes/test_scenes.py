@@ -1,4 +1,5 @@
-"""Random scenes: exact counts, everything in sight, noise as asked, and problems that can be solved."""
+"""Random scenes: exact counts, everything in sight, noise as asked, and problems that can be
+solved."""
 
 from __future__ import annotations
 
@@ -97,7 +98,11 @@ def test_the_cameras_hang_together(trajectory):
     scene = random_scene(middle(trajectory), 2)
     nodes = scene.num_cameras + scene.num_points
     links = coo_array(
-        (np.ones(scene.num_observations), (scene.camera_index, scene.num_cameras + scene.point_index)), (nodes, nodes)
+        (
+            np.ones(scene.num_observations),
+            (scene.camera_index, scene.num_cameras + scene.point_index),
+        ),
+        (nodes, nodes),
     )
     assert connected_components(links, directed=False)[0] == 1
 
@@ -125,7 +130,8 @@ def test_the_histogram_is_the_power_law_with_cut_off():
 
 @needs_data
 @pytest.mark.parametrize(
-    ("name", "file"), [("ladybug-49", "problem-49-7776-pre"), ("trafalgar-21", "problem-21-11315-pre")]
+    ("name", "file"),
+    [("ladybug-49", "problem-49-7776-pre"), ("trafalgar-21", "problem-21-11315-pre")],
 )
 def test_track_lengths_are_spread_as_in_the_real_problem(name, file):
     from jaxba.io import read_problem
@@ -227,7 +233,8 @@ def test_the_truth_has_residuals_of_the_asked_noise(noise):
     values = residuals(truth).ravel()
     assert values.mean() == pytest.approx(0, abs=5 * noise / np.sqrt(values.size))
     assert values.std() == pytest.approx(noise, rel=5 / np.sqrt(2 * values.size))
-    # Half the squared noise times chi-square of 2N degrees of freedom: mean noise^2 N, sigma noise^2 sqrt(N).
+    # Half the squared noise times chi-square of 2N degrees of freedom: mean noise^2 N, sigma
+    # noise^2 sqrt(N).
     count = truth.num_observations
     assert cost(truth) == pytest.approx(noise**2 * count, abs=5 * noise**2 * np.sqrt(count))
 
@@ -248,7 +255,9 @@ def test_without_start_noise_the_start_is_the_truth():
     np.testing.assert_allclose(start.points, truth.points, atol=1e-9)
 
 
-@pytest.mark.parametrize("knob", ["start_rotation", "start_center", "start_point", "start_focal", "start_drift"])
+@pytest.mark.parametrize(
+    "knob", ["start_rotation", "start_center", "start_point", "start_focal", "start_drift"]
+)
 def test_each_knob_of_the_start_moves_it_further_away(knob):
     still = {field.name: 0.0 for field in fields(SceneConfig) if field.name.startswith("start_")}
     quiet = middle("forward", **still)
@@ -256,7 +265,9 @@ def test_each_knob_of_the_start_moves_it_further_away(knob):
     assert costs[0] < costs[1] < costs[2]
 
 
-@pytest.mark.parametrize("name", [*SMALL_NAMES, pytest.param("dubrovnik-356", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [*SMALL_NAMES, pytest.param("dubrovnik-356", marks=pytest.mark.slow)]
+)
 def test_the_start_is_as_far_as_bal_starts_are(name):
     start, truth = random_scene_with_truth(scene_like(name), 0)
     assert 10 < cost(start) / cost(truth) < 200
@@ -271,7 +282,9 @@ def test_drift_bends_the_path_but_hardly_the_neighbourhood():
     assert moved[0] == pytest.approx(0, abs=1e-9)
     assert moved[-1] > 5 * moved[5]
     steps = np.linalg.norm(np.diff(camera_centers(start.cameras), axis=0), axis=1)
-    np.testing.assert_allclose(steps, np.linalg.norm(np.diff(camera_centers(truth.cameras), axis=0), axis=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        steps, np.linalg.norm(np.diff(camera_centers(truth.cameras), axis=0), axis=1), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", ["tiny", "paper"])
@@ -297,7 +310,9 @@ def solve(problem: BundleProblem) -> float:
         return residuals(moved).ravel()
 
     x = np.concatenate([problem.cameras.ravel(), problem.points.ravel()])
-    return float(least_squares(function, x, method="trf", x_scale="jac", ftol=1e-5, max_nfev=30).cost)
+    return float(
+        least_squares(function, x, method="trf", x_scale="jac", ftol=1e-5, max_nfev=30).cost
+    )
 
 
 # Refusals

@@ -1,4 +1,5 @@
-"""Configurations: found by name in a clone and from a wheel, and what one that extends another says."""
+"""Configurations: found by name in a clone and from a wheel, and what one that extends another
+says."""
 
 from __future__ import annotations
 
@@ -62,7 +63,10 @@ def test_hidden_files_are_no_configurations(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_unknown_name_lists_those_that_are_known(kind):
     known = ", ".join(names(kind))
-    assert refused(kind, "nothing") == f"no configuration 'nothing'; known: {known}, or the path of a file"
+    assert (
+        refused(kind, "nothing")
+        == f"no configuration 'nothing'; known: {known}, or the path of a file"
+    )
 
 
 def test_a_name_is_no_file_of_the_working_folder(tmp_path, monkeypatch):
@@ -82,7 +86,12 @@ def test_mappings_are_merged_key_by_key_and_the_file_wins(tmp_path):
         middle="extends: low.yaml\na: {b: {c: 2, d: 2}}\nnone: {x: 1}\n",
         low="a: {b: {d: 3, e: 3}, f: 3}\nlist: [1, 2]\ng: {h: 3}\n",
     )
-    merged = {"a": {"b": {"c": 1, "d": 2, "e": 3}, "f": 3}, "list": [9], "none": None, "g": {"h": 3}}
+    merged = {
+        "a": {"b": {"c": 1, "d": 2, "e": 3}, "f": 3},
+        "list": [9],
+        "none": None,
+        "g": {"h": 3},
+    }
     assert read("train", path) == merged
 
 
@@ -104,24 +113,39 @@ def test_what_is_read_is_the_readers_own():
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"a": "extends: plane"}, "{0}/a.yaml: extends: no configuration 'plane'; known: default, fast, paper"),
+        (
+            {"a": "extends: plane"},
+            "{0}/a.yaml: extends: no configuration 'plane'; known: default, fast, paper",
+        ),
         ({"a": "extends: b.yaml"}, "{0}/a.yaml: extends: b.yaml: No such file or directory"),
         ({"a": "extends: ./"}, "{0}/a.yaml: extends: ./: Is a directory"),
-        ({"a": "extends: [plain]"}, "{0}/a.yaml: extends must be a name or the path of a file, is ['plain']"),
+        (
+            {"a": "extends: [plain]"},
+            "{0}/a.yaml: extends must be a name or the path of a file, is ['plain']",
+        ),
         ({"a": "extends:"}, "{0}/a.yaml: extends must be a name or the path of a file, is None"),
         ({"a": "extends: a.yaml"}, "{0}/a.yaml extends a.yaml: a circle"),
         (
             {"a": "extends: b.yaml", "b": "extends: c.yaml", "c": "extends: ./b.yaml"},
             "{0}/a.yaml extends b.yaml extends c.yaml extends ./b.yaml: a circle",
         ),
-        ({"a": "extends: b.yaml", "b": "extends: plane"}, "b.yaml: extends: no configuration 'plane'"),
+        (
+            {"a": "extends: b.yaml", "b": "extends: plane"},
+            "b.yaml: extends: no configuration 'plane'",
+        ),
         ({"a": "extends: b.yaml", "b": "- 1"}, "{0}/a.yaml: extends: b.yaml: must be a mapping"),
-        ({"a": "extends: b.yaml", "b": "x: 1\ny: ["}, "{0}/a.yaml: extends: b.yaml line 2: not YAML"),
+        (
+            {"a": "extends: b.yaml", "b": "x: 1\ny: ["},
+            "{0}/a.yaml: extends: b.yaml line 2: not YAML",
+        ),
         ({"a": "x: 1\ny: {z: 1}\nx: 2"}, "{0}/a.yaml line 3: x is there twice"),
         ({"a": "x: 1\ny: [{z: 1, w: 2,\n z: 3}]"}, "{0}/a.yaml line 3: z is there twice"),
         ({"a": "x: &a {y: *a, z: 1, z: 1}"}, "{0}/a.yaml: z is there twice"),
         ({"a": "[" * 3000}, "{0}/a.yaml: not YAML"),
-        ({"a": 'extends: "x\\ny.yaml"'}, "{0}/a.yaml: extends: x\\ny.yaml: No such file or directory"),
+        (
+            {"a": 'extends: "x\\ny.yaml"'},
+            "{0}/a.yaml: extends: x\\ny.yaml: No such file or directory",
+        ),
         ({"a": 'extends: "x\\0.yaml"'}, "{0}/a.yaml: extends: x\\x00.yaml: embedded null"),
     ],
 )
@@ -135,7 +159,9 @@ def test_circles_and_bases_that_cannot_be_read_are_one_line(files, message, tmp_
 @pytest.mark.slow
 def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distribution(tmp_path):
     backend, clone = tmp_path / "backend", tmp_path / "clone"
-    requires = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["build-system"]["requires"]
+    requires = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["build-system"][
+        "requires"
+    ]
     pip = [sys.executable, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
     subprocess.run([*pip, "--target", str(backend), *requires], check=True, timeout=300)
     clone.mkdir()
@@ -148,7 +174,12 @@ def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distr
         code = f"from setuptools import build_meta; build_meta.build_{what}({str(tmp_path)!r})"
         env = {**os.environ, "PYTHONPATH": str(backend)}
         done = subprocess.run(
-            [sys.executable, "-c", code], cwd=source, env=env, capture_output=True, text=True, timeout=120
+            [sys.executable, "-c", code],
+            cwd=source,
+            env=env,
+            capture_output=True,
+            text=True,
+            timeout=120,
         )
         assert done.returncode == 0, done.stderr
         (file,) = tmp_path.glob("*.whl" if what == "wheel" else "*.tar.gz")
@@ -166,10 +197,14 @@ def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distr
         wheel.unlink()
         code = (
             "from jaxba.settings.configurations import find, names, read\n"
-            f"kinds, expected, at = {KINDS!r}, {expected!r}, {str(installed / 'jaxba/configs/train/default.yaml')!r}\n"
+            f"kinds, expected, at = {KINDS!r}, {expected!r}, "
+            f"{str(installed / 'jaxba/configs/train/default.yaml')!r}\n"
             "assert str(find('train', 'default')) == at\n"
-            "assert {kind: {name: read(kind, name) for name in names(kind)} for kind in kinds} == expected\n"
+            "assert {kind: {name: read(kind, name) for name in names(kind)} for kind in kinds} == "
+            "expected\n"
         )
         env = {**os.environ, "PYTHONPATH": str(installed)}
-        found = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
+        found = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True
+        )
         assert found.returncode == 0, found.stderr

@@ -1,4 +1,5 @@
-"""A solve that was stopped or killed continues from its checkpoint and ends as if nothing had happened."""
+"""A solve that was stopped or killed continues from its checkpoint and ends as if nothing had
+happened."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from jaxba.problem import geometry
 from jaxba.problem.labels import Labels
 from jaxba.solver import checkpoint, sharded
 
-OPTIONS = SolveOptions(linear_solver="implicit", max_iterations=8, tolerances=jaxba.Tolerances(ftol=0.0))
+OPTIONS = SolveOptions(
+    linear_solver="implicit", max_iterations=8, tolerances=jaxba.Tolerances(ftol=0.0)
+)
 
 
 class Killed(Exception):
@@ -34,7 +37,9 @@ def killed_after(count: int):
 
 @pytest.mark.parametrize("in_parts", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("policy", ["ceres", pytest.param("guarded", marks=pytest.mark.slow)])
-def test_a_solve_that_was_killed_continues_to_the_same_end(policy, in_parts, tmp_path, monkeypatch, capsys):
+def test_a_solve_that_was_killed_continues_to_the_same_end(
+    policy, in_parts, tmp_path, monkeypatch, capsys
+):
     problem, file = support.tiny(), tmp_path / "solve.npz"
     monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
     if in_parts:
@@ -47,11 +52,18 @@ def test_a_solve_that_was_killed_continues_to_the_same_end(policy, in_parts, tmp
     assert file.exists()
     numbers = []
     found = solve(
-        problem, policy, OPTIONS, checkpoint=file, callback=lambda one: numbers.append(one.iteration), verbose=True
+        problem,
+        policy,
+        OPTIONS,
+        checkpoint=file,
+        callback=lambda one: numbers.append(one.iteration),
+        verbose=True,
     )
     told = capsys.readouterr().out
     assert "goes on after 3 iterations" in told
-    assert [int(line.split()[0]) for line in told.splitlines() if line[:4].strip().isdigit()][:2] == [3, 4]
+    assert [int(line.split()[0]) for line in told.splitlines() if line[:4].strip().isdigit()][
+        :2
+    ] == [3, 4]
     assert numbers[0] == 4
     assert found.initial_cost == pytest.approx(whole.initial_cost, rel=1e-12)
     for name in ("cost", "damping", "accepted"):
@@ -62,13 +74,21 @@ def test_a_solve_that_was_killed_continues_to_the_same_end(policy, in_parts, tmp
 
 def test_numbers_of_residuals_are_in_it_and_more_iterations_may_follow(tmp_path):
     problem, file = support.tiny(), tmp_path / "solve.npz"
-    problem = jaxba.with_residual(problem, scaled(size=0, pose=[0, 1], measured=0.5), unknowns={"size": [[1.0]]})
-    stopped = solve(problem, "ceres", OPTIONS, checkpoint=file, callback=lambda record: record.iteration == 3)
+    problem = jaxba.with_residual(
+        problem, scaled(size=0, pose=[0, 1], measured=0.5), unknowns={"size": [[1.0]]}
+    )
+    stopped = solve(
+        problem, "ceres", OPTIONS, checkpoint=file, callback=lambda record: record.iteration == 3
+    )
     assert stopped.iterations == 3
-    more = SolveOptions(linear_solver="implicit", max_iterations=12, tolerances=jaxba.Tolerances(ftol=0.0))
+    more = SolveOptions(
+        linear_solver="implicit", max_iterations=12, tolerances=jaxba.Tolerances(ftol=0.0)
+    )
     found, whole = solve(problem, "ceres", more, checkpoint=file), solve(problem, "ceres", more)
     assert found.iterations == whole.iterations
-    np.testing.assert_allclose(found.problem.residuals.blocks[0], whole.problem.residuals.blocks[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.problem.residuals.blocks[0], whole.problem.residuals.blocks[0], rtol=1e-6
+    )
 
 
 @jaxba.residual
@@ -83,7 +103,9 @@ def test_a_reached_limit_is_not_solved_again_and_networks_differ_by_their_weight
     assert again.iterations == done.iterations == 5
     assert again.termination == done.termination == jaxba.Termination.MAX_ITERATIONS
     assert again.final_cost == pytest.approx(done.final_cost, rel=1e-9)
-    none = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=0), checkpoint=file)
+    none = solve(
+        problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=0), checkpoint=file
+    )
     assert none.final_cost == pytest.approx(done.final_cost, rel=1e-9)
     learned = jaxba.make_policy("learned")
     first, *others = learned.layers
@@ -98,12 +120,18 @@ def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):
     problem, file = support.tiny(), tmp_path / "solve.npz"
     options = SolveOptions(max_iterations=1)
     solve(problem, "ceres", options, checkpoint=file)
-    for other, policy in ((problem.replace(points=problem.points + 1e-3), "ceres"), (problem, "nielsen")):
-        with pytest.raises(ProblemError, match=r"solve.npz is the checkpoint of another problem, policy or options"):
+    for other, policy in (
+        (problem.replace(points=problem.points + 1e-3), "ceres"),
+        (problem, "nielsen"),
+    ):
+        with pytest.raises(
+            ProblemError, match=r"solve.npz is the checkpoint of another problem, policy or options"
+        ):
             solve(other, policy, options, checkpoint=file)
     whole, array = file.read_bytes(), tmp_path / "array.npy"
     np.save(array, np.zeros(3))
-    compression, flags = whole.rindex(b"PK\x01\x02") + 10, whole.rindex(b"PK\x01\x02") + 8  # of the last member
+    # of the last member
+    compression, flags = whole.rindex(b"PK\x01\x02") + 10, whole.rindex(b"PK\x01\x02") + 8
     flipped = [whole[:at] + b"\x01" + whole[at + 1 :] for at in (compression, flags)]
     for damaged in (whole[:100], array.read_bytes(), *flipped):
         file.write_bytes(damaged)
@@ -119,7 +147,9 @@ def test_a_solve_whose_checkpoint_cannot_be_written_goes_on(tmp_path, monkeypatc
 
     monkeypatch.setattr(checkpoint, "atomic_write", full)
     options = SolveOptions(max_iterations=2)
-    with pytest.warns(jaxba.ProblemWarning, match=r"solve.npz: No space left on device; the solve goes on"):
+    with pytest.warns(
+        jaxba.ProblemWarning, match=r"solve.npz: No space left on device; the solve goes on"
+    ):
         found = solve(support.tiny(), "ceres", options, checkpoint=tmp_path / "solve.npz")
     assert found.iterations == 2
 
@@ -143,7 +173,13 @@ def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance
     elsewhere = types.FunctionType(own_loss.__code__, globals(), "own_loss")
     options = replace(options, loss=jaxba.Loss(elsewhere, 2.0), max_iterations=3, within=1e-12)
     numbers = []
-    solve(problem, "ceres", options, checkpoint=file, callback=lambda record: numbers.append(record.iteration))
+    solve(
+        problem,
+        "ceres",
+        options,
+        checkpoint=file,
+        callback=lambda record: numbers.append(record.iteration),
+    )
     assert numbers == [3]
     other = replace(options, loss=jaxba.Loss(another_loss(), 2.0))
     with pytest.raises(ProblemError, match="the checkpoint of another problem, policy or options"):
@@ -152,12 +188,23 @@ def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance
 
 @pytest.mark.slow
 def test_functions_and_losses_of_residuals_belong_to_a_checkpoint(tmp_path):
-    problem, file, rows = support.tiny(), tmp_path / "solve.npz", scaled(size=0, pose=[0, 1], measured=0.5)
+    problem, file, rows = (
+        support.tiny(),
+        tmp_path / "solve.npz",
+        scaled(size=0, pose=[0, 1], measured=0.5),
+    )
     options = SolveOptions(max_iterations=1)
-    registered = lambda rows, loss: jaxba.with_residual(problem, rows, unknowns={"size": [[1.0]]}, loss=loss)
+    registered = lambda rows, loss: jaxba.with_residual(
+        problem, rows, unknowns={"size": [[1.0]]}, loss=loss
+    )
     solve(registered(rows, jaxba.Loss()), "ceres", options, checkpoint=file)
-    for other in (registered(rows, jaxba.Loss("cauchy")), registered(raised(size=0, pose=[0, 1], measured=0.5), None)):
-        with pytest.raises(ProblemError, match="the checkpoint of another problem, policy or options"):
+    for other in (
+        registered(rows, jaxba.Loss("cauchy")),
+        registered(raised(size=0, pose=[0, 1], measured=0.5), None),
+    ):
+        with pytest.raises(
+            ProblemError, match="the checkpoint of another problem, policy or options"
+        ):
             solve(other, "ceres", options, checkpoint=file)
 
 

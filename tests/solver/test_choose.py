@@ -23,7 +23,12 @@ from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.residual_slots import laid_out
 
 SEQUENCE = SceneConfig(
-    cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
+    cameras=300,
+    points=6000,
+    observations=24000,
+    max_depth=10.0,
+    gap_share=0.0,
+    trajectory="lateral",
 )
 """A point is seen by up to 18 cameras in a row."""
 
@@ -33,7 +38,9 @@ def renumbered(problem: BundleProblem, seed: int) -> BundleProblem:
     order = np.random.default_rng(seed).permutation(problem.num_cameras)
     cameras = np.empty_like(problem.cameras)
     cameras[order] = problem.cameras
-    return problem.replace(cameras=cameras, camera_index=order[problem.camera_index].astype(np.int32))
+    return problem.replace(
+        cameras=cameras, camera_index=order[problem.camera_index].astype(np.int32)
+    )
 
 
 # Counts
@@ -52,7 +59,9 @@ def test_pairs_blocks_and_reach_are_those_of_brute_force(cameras, points, seed, 
                 shared[a, b] = shared[b, a] = True
     row, column = np.nonzero(shared)
     rank = np.argsort(reverse_cuthill_mckee(csr_matrix(shared), symmetric_mode=True))
-    reach = min(np.abs(row - column).max(initial=0), np.abs(rank[row] - rank[column]).max(initial=0))
+    reach = min(
+        np.abs(row - column).max(initial=0), np.abs(rank[row] - rank[column]).max(initial=0)
+    )
     assert count_pairs(ObservationOrder.of(problem)) == (pairs, np.tril(shared).sum(), reach)
 
 
@@ -98,14 +107,20 @@ def test_a_system_of_hundreds_of_cameras_without_a_band_is_not_factored():
     """As many cameras and observations, but every point is seen from anywhere."""
     problem = random_scene(SEQUENCE, 0)
     rng = np.random.default_rng(0)
-    anywhere = problem.replace(camera_index=rng.integers(300, size=problem.num_observations).astype(np.int32))
+    anywhere = problem.replace(
+        camera_index=rng.integers(300, size=problem.num_observations).astype(np.int32)
+    )
     assert count_pairs(ObservationOrder.of(anywhere)).bandwidth > 200
     assert predict(anywhere)["explicit"] > 5 * predict(problem)["explicit"]
     assert choose_linear_solver(anywhere, StepOptions(), "auto").linear_solver != "explicit"
 
 
 def test_a_few_cameras_are_factored():
-    for problem in (support.tiny(), support.single(), random_scene(replace(SEQUENCE, cameras=50), 0)):
+    for problem in (
+        support.tiny(),
+        support.single(),
+        random_scene(replace(SEQUENCE, cameras=50), 0),
+    ):
         assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
 
 
@@ -117,7 +132,8 @@ def test_a_few_cameras_in_rigs_with_priors_are_factored_though_a_product_is_quic
 
 
 def test_many_cameras_that_see_few_points_are_factored_by_way_of_the_points():
-    """As with the corners of a calibration board; without that way 2700 unknowns would be factored."""
+    """As with the corners of a calibration board; without that way 2700 unknowns would be
+    factored."""
     board = random_views(300, 20, 0)
     assert predict(board)["explicit"] < min(predict(board)["sparse"], predict(board)["implicit"])
     assert choose_linear_solver(board, StepOptions(), "auto").linear_solver == "explicit"
@@ -132,7 +148,8 @@ def test_a_factorisation_beyond_the_machine_is_refused_where_there_is_no_choice(
     assert choose_linear_solver(problem, options, "explicit").linear_solver == "explicit"
     monkeypatch.setattr("jaxba.runtime.process.memory", lambda: 1e6)
     with pytest.raises(
-        ProblemError, match=r"^50 cameras take some 0 GB to solve by a factorisation, more than the 0 GB"
+        ProblemError,
+        match=r"^50 cameras take some 0 GB to solve by a factorisation, more than the 0 GB",
     ):
         choose_linear_solver(problem, options, "explicit")
     assert choose_linear_solver(problem, StepOptions(), "implicit").linear_solver == "implicit"

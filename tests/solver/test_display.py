@@ -26,7 +26,9 @@ def picture(html: str) -> np.ndarray:
 
 
 def test_a_solution_is_one_short_line(solution):
-    assert re.fullmatch(r"Solution\(converged: .* within ftol, cost: .* -> .*, iterations: .*\)", repr(solution))
+    assert re.fullmatch(
+        r"Solution\(converged: .* within ftol, cost: .* -> .*, iterations: .*\)", repr(solution)
+    )
     assert len(repr(solution)) < 200
 
 

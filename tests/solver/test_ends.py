@@ -1,5 +1,5 @@
-"""Ends are honest: nothing is called converged where nothing could happen, no focal length changes its sign, and what
-is said of a start is what the solve computed."""
+"""Ends are honest: nothing is called converged where nothing could happen, no focal length changes
+its sign, and what is said of a start is what the solve computed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ import support
 from support import solve, start, step
 
 import jaxba
-from jaxba import BundleProblem, Loss, ProblemError, SolveOptions, StepOptions, Termination, make_policy, retriangulate
+from jaxba import (
+    BundleProblem,
+    Loss,
+    ProblemError,
+    SolveOptions,
+    StepOptions,
+    Termination,
+    make_policy,
+    retriangulate,
+)
 from jaxba.cli.solve import run
 from jaxba.damping.registry import POLICIES
 from jaxba.problem import geometry
@@ -72,7 +81,10 @@ def test_the_command_says_what_to_do(tmp_path, capsys):
     assert run([str(path), "--loss", "tukey"]) == 0
     printed = capsys.readouterr().out
     assert "not converged: every residual lies beyond the scale of the loss" in printed
-    assert "200 observations of 200 beyond --loss-scale 1 px had no weight: choose a larger one (half" in printed
+    assert (
+        "200 observations of 200 beyond --loss-scale 1 px had no weight: choose a larger one (half"
+        in printed
+    )
     assert "424 px" in printed  # 300 px each way
 
 
@@ -81,7 +93,8 @@ def test_the_command_says_what_to_do(tmp_path, capsys):
 
 @functools.cache
 def mirrored() -> BundleProblem:
-    """`tiny` with the pixels of one camera on the other side of the centre, which a negative focal length would fit."""
+    """`tiny` with the pixels of one camera on the other side of the centre, which a negative focal
+    length would fit."""
     problem = support.tiny()
     side = np.where(problem.camera_index == 2, -1.0, 1.0)[:, None]
     return problem.replace(observations=side * problem.observations)
@@ -106,7 +119,9 @@ QUICK = {"ceres", "classic", "gauss-newton", "guarded", "ceres+embedded"}
         *sorted(QUICK),
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in sorted({*NAMES, "ceres+refine3", "classic+embedded", "guarded+embedded"} - QUICK)
+            for name in sorted(
+                {*NAMES, "ceres+refine3", "classic+embedded", "guarded+embedded"} - QUICK
+            )
         ),
     ],
 )
@@ -154,7 +169,9 @@ def test_without_iterations_the_start_is_measured_and_comes_back(asked):
     assert found.termination == Termination.MAX_ITERATIONS
     assert (found.iterations, found.accepted, found.converged) == (0, 0, False)
     assert found.initial_cost == found.final_cost
-    np.testing.assert_allclose(found.final_cost, geometry.cost(problem), rtol=1e-12 if "dtype" not in asked else 1e-4)
+    np.testing.assert_allclose(
+        found.final_cost, geometry.cost(problem), rtol=1e-12 if "dtype" not in asked else 1e-4
+    )
     assert all(len(field) == 0 for field in found.history)
     assert np.array_equal(found.problem.cameras, problem.cameras)
     assert np.array_equal(found.problem.points, problem.points)
@@ -175,10 +192,15 @@ def test_a_point_on_the_plane_of_a_camera_is_named():
 
 
 def test_an_overflow_of_float32_alone_is_explained_as_one():
-    with pytest.raises(ProblemError, match=r"observation 17, .* overflows in float32; float64 has a larger range"):
+    with pytest.raises(
+        ProblemError, match=r"observation 17, .* overflows in float32; float64 has a larger range"
+    ):
         solve(huge(1e20), "ceres", dtype="float32", max_iterations=1)
     assert np.isfinite(solve(huge(1e20), "ceres", max_iterations=1).final_cost)
-    with pytest.raises(ProblemError, match=r"observation 17, point \d+ has a residual in camera \d+ that overflows$"):
+    with pytest.raises(
+        ProblemError,
+        match=r"observation 17, point \d+ has a residual in camera \d+ that overflows$",
+    ):
         solve(huge(1e200), "ceres", max_iterations=1)
 
 
@@ -190,7 +212,8 @@ def test_a_sum_that_overflows_names_no_observation():
 
 
 def test_the_explanation_is_that_of_the_loss():
-    """A residual whose square overflows has a finite cost under no loss that looks at the square."""
+    """A residual whose square overflows has a finite cost under no loss that looks at the
+    square."""
     assert "observation 17" in explain_start(huge(1e200), Loss("cauchy"))
 
 
@@ -198,6 +221,10 @@ def test_messages_call_images_and_points_what_the_model_calls_them():
     problem = huge(1e200)
     camera, point = problem.camera_index[17], problem.point_index[17]
     names, count = tuple(f"{k}.jpg" for k in range(problem.num_cameras)), problem.num_cameras
-    labels = Labels(names, 70 + np.arange(count), np.arange(count), 7000 + np.arange(problem.num_points))
-    words = f"point {7000 + point} has a residual in image {70 + camera} ({camera}.jpg) that overflows"
+    labels = Labels(
+        names, 70 + np.arange(count), np.arange(count), 7000 + np.arange(problem.num_points)
+    )
+    words = (
+        f"point {7000 + point} has a residual in image {70 + camera} ({camera}.jpg) that overflows"
+    )
     assert words in explain_start(problem.replace(labels=labels), Loss("cauchy"))

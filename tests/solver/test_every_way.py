@@ -1,5 +1,5 @@
-"""A problem with rows of any residual ends in the same way however it is solved: alone, among many, padded, in parts,
-on several devices, and from a checkpoint."""
+"""A problem with rows of any residual ends in the same way however it is solved: alone, among many,
+padded, in parts, on several devices, and from a checkpoint."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from jaxba.structure.cells import Sizes
 
 OPTIONS = SolveOptions(compilation="quick", max_iterations=4)
 EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-12)
-"""To the solution of the linear system: steps that stop before it differ by up to 1e-5 with the order of sums."""
+"""To the solution of the linear system: steps that stop before it differ by up to 1e-5 with the
+order of sums."""
 
 DEVICES = 3  # of the tests (conftest.py)
 ALIKE = 1e-9  # largest relative difference of costs
@@ -47,7 +48,9 @@ def in_parts(monkeypatch):
 
 def problems_of(names: list[str], count: int) -> list[BundleProblem]:
     """Problems of one shape with other scenes and other data."""
-    return [row_examples.with_rows_of(row_examples.scene(seed), names, seed) for seed in range(count)]
+    return [
+        row_examples.with_rows_of(row_examples.scene(seed), names, seed) for seed in range(count)
+    ]
 
 
 def assert_alike(found: Solution, alone: Solution) -> None:
@@ -88,7 +91,9 @@ def test_rows_of_any_residual_are_solved_among_many_as_alone(name, small):
 def test_rows_of_scenes_in_map_coordinates_are_each_in_its_own_frame(small):
     """These are solved near the origin, from which each was moved by another way."""
     near = problems_of(["control_point", "position"], 4)
-    assert_as_alone([shift(one, np.array([4e3 * (1 + k), -5e3, 300.0])) for k, one in enumerate(near)], "ceres")
+    assert_as_alone(
+        [shift(one, np.array([4e3 * (1 + k), -5e3, 300.0])) for k, one in enumerate(near)], "ceres"
+    )
 
 
 @pytest.mark.slow
@@ -108,10 +113,20 @@ def test_rows_of_any_residual_end_the_same_on_several_lanes(name):
     cell = Sizes(*np.max([one[:4] for one in sizes], axis=0).tolist(), 0)
     with numerics("float64"):
         setups = [set_up(problem, "ceres", OPTIONS, capacity=cell.capacity) for problem in kept]
-        starts = jax.tree.map(lambda *leaves: np.stack(leaves), *[Starts(one.layout, *one.start) for one in setups])
+        starts = jax.tree.map(
+            lambda *leaves: np.stack(leaves), *[Starts(one.layout, *one.start) for one in setups]
+        )
         run = jax.jit(solve_rows, static_argnames=("options", "length", "lanes"))
         count = len(kept)
-        given = starts, setups[0].policy, Tolerances(), np.int32(4), np.int32(count), setups[0].options, 4
+        given = (
+            starts,
+            setups[0].policy,
+            Tolerances(),
+            np.int32(4),
+            np.int32(count),
+            setups[0].options,
+            4,
+        )
         one, several = (run(*given, lanes=lanes) for lanes in (1, 2))
     np.testing.assert_allclose(several.initial_cost, one.initial_cost, rtol=ALIKE)
     np.testing.assert_allclose(several.history.cost, one.history.cost, rtol=ALIKE)

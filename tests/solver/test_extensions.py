@@ -1,4 +1,5 @@
-"""A loss and a policy of one's own, written as somebody would who has only read the documentation."""
+"""A loss and a policy of one's own, written as somebody would who has only read the
+documentation."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ def test_a_loss_written_by_hand_is_the_named_one(name, rho, asked):
 
 
 def test_geman_mcclure_counts_what_its_formula_says():
-    """`rho(s) = s / (1 + s)`, of `s = r^2 / scale^2`; no pixel costs more than half of the squared scale."""
+    """`rho(s) = s / (1 + s)`, of `s = r^2 / scale^2`; no pixel costs more than half of the squared
+    scale."""
     scale = 2.5
     solution = with_loss(Loss(geman_mcclure, scale))
 
@@ -56,13 +58,18 @@ def test_geman_mcclure_counts_what_its_formula_says():
     assert solution.converged
     np.testing.assert_allclose(solution.initial_cost, cost(support.tiny()), rtol=1e-12)
     np.testing.assert_allclose(solution.final_cost, cost(solution.problem), rtol=1e-10)
-    assert solution.final_cost < solution.initial_cost < 0.5 * scale**2 * support.tiny().num_observations
+    assert (
+        solution.final_cost
+        < solution.initial_cost
+        < 0.5 * scale**2 * support.tiny().num_observations
+    )
 
 
 @register_pytree
 @dataclass(frozen=True)
 class Steady:
-    """Lambda is divided by one number after an accepted step and multiplied by another after a rejected one."""
+    """Lambda is divided by one number after an accepted step and multiplied by another after a
+    rejected one."""
 
     initial: float = 1e-2
     fall: float = 3.0
@@ -86,7 +93,9 @@ def test_a_policy_written_by_hand_drives_a_solve(callback):
     assert solution.converged
     factors = np.where(solution.history.accepted[:-1], 1 / 3, 10.0)
     np.testing.assert_allclose(solution.history.damping[0], 0.5)
-    np.testing.assert_allclose(solution.history.damping[1:] / solution.history.damping[:-1], factors, rtol=1e-12)
+    np.testing.assert_allclose(
+        solution.history.damping[1:] / solution.history.damping[:-1], factors, rtol=1e-12
+    )
     assert (solution.history.gain_ratio[solution.history.accepted] > 0.1).all()
     best = jaxba.solve(support.tiny(), "ceres", options, callback=callback)
     np.testing.assert_allclose(solution.final_cost, best.final_cost, rtol=1e-4)
@@ -111,7 +120,8 @@ def test_policies_that_jax_cannot_tell_apart_are_refused():
     first, second = make(2.0), make(3.0)
     jaxba.prepare(support.tiny(), first)
     with pytest.raises(
-        ValueError, match=r"Twin cannot be told from policy Twin of this process.*jaxba\.register_pytree"
+        ValueError,
+        match=r"Twin cannot be told from policy Twin of this process.*jaxba\.register_pytree",
     ):
         jaxba.prepare(support.tiny(), second)
     jaxba.prepare(support.tiny(), first)

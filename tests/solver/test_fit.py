@@ -1,4 +1,5 @@
-"""The tests of residuals and the search for wrong rows, against dense least squares with known deviations."""
+"""The tests of residuals and the search for wrong rows, against dense least squares with known
+deviations."""
 
 from __future__ import annotations
 
@@ -15,14 +16,16 @@ def design(seed: int = 0) -> np.ndarray:
 
 
 def left_of(jacobian: np.ndarray, values: np.ndarray, size: int = SIZE) -> Left:
-    """What least squares leave, by a pseudo-inverse: half of the rows are of one kind, half of another."""
+    """What least squares leave, by a pseudo-inverse: half of the rows are of one kind, half of
+    another."""
     cofactor = np.eye(len(jacobian)) - jacobian @ np.linalg.pinv(jacobian)
     at = np.arange(len(jacobian)).reshape(-1, size)
     return Left(cofactor @ values, cofactor, (at[: len(at) // 2], at[len(at) // 2 :]))
 
 
 def test_right_deviations_fail_as_often_as_the_level_says():
-    """Both tests of two kinds: 2,000 draws at a level of 5%; a rate below 2% would be a test without power."""
+    """Both tests of two kinds: 2,000 draws at a level of 5%; a rate below 2% would be a test
+    without power."""
     left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(1)
     failed = 0
     for _ in range(2000):
@@ -33,15 +36,19 @@ def test_right_deviations_fail_as_often_as_the_level_says():
 
 def test_residuals_without_their_covariance_fail_less_often():
     left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(2)
-    drawn = [(left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(1000)]
+    drawn = [
+        (left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(1000)
+    ]
     assert np.mean([not fits(one, 0.05) for one in drawn]) < 0.05
 
 
 def test_unknowns_of_rows_alone_make_the_test_of_all_rows_sharper_at_the_same_level():
-    """12 unknowns of 60 numbers: half of the level is that of the sum of squares, which rows with standard
-    deviations too small by 1.3 exceed more often than without the number of unknowns."""
+    """12 unknowns of 60 numbers: half of the level is that of the sum of squares, which rows with
+    standard deviations too small by 1.3 exceed more often than without the number of unknowns."""
     left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(9)
-    drawn = [(left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(2000)]
+    drawn = [
+        (left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(2000)
+    ]
     failed = np.mean([not fits(residual, 0.05, UNKNOWNS) for residual in drawn])
     assert failed < 0.065  # as above
     sharper = np.mean([not fits(1.3 * residual, 0.05, UNKNOWNS) for residual in drawn])
@@ -62,7 +69,9 @@ def test_what_is_left_without_rows_is_what_a_solve_without_them_leaves():
     np.testing.assert_allclose(off, (values - jacobian @ step)[row], atol=1e-10)
     both = np.sort(np.concatenate([kept, row]))
     with_row = np.linalg.lstsq(jacobian[both], values[both], rcond=None)[1][0]
-    np.testing.assert_allclose(square, with_row - np.sum((values - jacobian @ step)[kept] ** 2), rtol=1e-9)
+    np.testing.assert_allclose(
+        square, with_row - np.sum((values - jacobian @ step)[kept] ** 2), rtol=1e-9
+    )
 
 
 def test_every_deletion_lowers_the_squares_by_its_statistic():
@@ -97,7 +106,8 @@ def test_deviations_that_are_all_too_small_are_no_wrong_rows():
 
 
 def test_rows_that_cannot_be_told_apart_are_named_together():
-    """Three measurements of one number, two of them of the same amount against the third's: a level and two heights."""
+    """Three measurements of one number, two of them of the same amount against the third's: a level
+    and two heights."""
     jacobian = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     left = left_of(jacobian, np.array([0.0, 50.0, 0.0, 0.0, 0.0, 0.0]), size=1)
     out = explained(left, ())

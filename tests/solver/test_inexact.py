@@ -1,4 +1,5 @@
-"""Inexact linear solvers end where a factorisation does, on random problems of every kind (random_problems.py)."""
+"""Inexact linear solvers end where a factorisation does, on random problems of every kind
+(random_problems.py)."""
 
 from __future__ import annotations
 

@@ -53,7 +53,9 @@ def assert_as_alone(found, problems, policy, options):
     alone = [jaxba.solve(problem, policy, options) for problem in problems]
     assert [one.iterations for one in found] == [one.iterations for one in alone]
     assert [one.termination for one in found] == [one.termination for one in alone]
-    np.testing.assert_allclose([x.final_cost for x in found], [x.final_cost for x in alone], rtol=1e-8)
+    np.testing.assert_allclose(
+        [x.final_cost for x in found], [x.final_cost for x in alone], rtol=1e-8
+    )
     for one, other in zip(found, alone, strict=True):
         np.testing.assert_allclose(one.problem.cameras, other.problem.cameras, rtol=1e-5, atol=1e-7)
         np.testing.assert_allclose(one.problem.points, other.problem.points, rtol=1e-5, atol=1e-6)
@@ -71,7 +73,11 @@ def test_one_that_cannot_be_solved_says_why_and_touches_no_other(small):
     problems = mixed(9)
     broken = problems[0].replace(points=np.full_like(problems[0].points, np.inf))
     found = list(
-        solve_many([problems[0], broken, *problems[1:4], OSError("no problem"), *problems[4:]], "ceres", QUICK)
+        solve_many(
+            [problems[0], broken, *problems[1:4], OSError("no problem"), *problems[4:]],
+            "ceres",
+            QUICK,
+        )
     )
     with pytest.raises(ProblemError) as alone:
         jaxba.solve(broken, "ceres", QUICK)
@@ -85,11 +91,17 @@ def test_one_that_cannot_be_solved_says_why_and_touches_no_other(small):
 def general() -> dict:
     """Problems with what cannot be padded, or with other residuals, four of each kind."""
     scenes = [scene(5, 30 + 3 * k, k) for k in range(4)]
-    shared = lambda p: p.replace(lenses=Lenses(np.zeros(p.num_cameras, np.int32), np.ones((1, 3), bool)))
+    shared = lambda p: p.replace(
+        lenses=Lenses(np.zeros(p.num_cameras, np.int32), np.ones((1, 3), bool))
+    )
     held = lambda p: jaxba.hold(p, poses=[0], points=[1, 2])
     placed = lambda p: jaxba.with_position_priors(
         p,
-        -np.einsum("cji,cj->ci", support.Rotation.from_rotvec(p.cameras[:, :3]).as_matrix(), p.cameras[:, 3:6]),
+        -np.einsum(
+            "cji,cj->ci",
+            support.Rotation.from_rotvec(p.cameras[:, :3]).as_matrix(),
+            p.cameras[:, 3:6],
+        ),
         stddev=0.1,
         align=False,
     )
@@ -103,8 +115,14 @@ def general() -> dict:
 
 def in_pairs(problem):
     """The problem with its first two cameras in one frame, where they are."""
-    matrices, shifts = geometry.rotation_matrices(problem.cameras[:, :3]), np.array(problem.cameras[:, 3:6])
-    rotation, translation = np.tile(np.eye(3), (problem.num_cameras, 1, 1)), np.zeros((problem.num_cameras, 3))
+    matrices, shifts = (
+        geometry.rotation_matrices(problem.cameras[:, :3]),
+        np.array(problem.cameras[:, 3:6]),
+    )
+    rotation, translation = (
+        np.tile(np.eye(3), (problem.num_cameras, 1, 1)),
+        np.zeros((problem.num_cameras, 3)),
+    )
     rotation[1] = matrices[1] @ matrices[0].T
     translation[1] = shifts[1] - rotation[1] @ shifts[0]
     frame = np.maximum(np.arange(problem.num_cameras) - 1, 0).astype(np.int32)
@@ -145,7 +163,10 @@ def test_a_program_that_fails_ends_nothing_but_its_problems(small, monkeypatch):
 
 @pytest.mark.slow
 def test_other_linear_solvers_solve_one_by_one(small):
-    problems, options = mixed(2), SolveOptions(linear_solver="implicit", max_iterations=4, compilation="quick")
+    problems, options = (
+        mixed(2),
+        SolveOptions(linear_solver="implicit", max_iterations=4, compilation="quick"),
+    )
     found = list(solve_many(problems, "ceres", options))
     assert {one.linear_solver for one in found} == {"implicit"}
     assert_as_alone(found, problems, "ceres", options)
@@ -166,7 +187,15 @@ def test_lanes_that_are_refilled_end_as_one_problem_after_the_other():
         rows = [Starts(one.layout, *one.start) for one in setups]
         starts = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         run = jax.jit(solve_rows, static_argnames=("options", "length", "lanes"))
-        given = starts, setups[0].policy, Tolerances(), np.int32(12), np.int32(6), setups[0].options, 16
+        given = (
+            starts,
+            setups[0].policy,
+            Tolerances(),
+            np.int32(12),
+            np.int32(6),
+            setups[0].options,
+            16,
+        )
         one, several = (run(*given, lanes=lanes) for lanes in (1, 3))
     np.testing.assert_array_equal(one.iterations[:6], several.iterations[:6])
     np.testing.assert_array_equal(one.termination[:6], several.termination[:6])
@@ -200,7 +229,9 @@ def test_every_problem_fits_its_cell_and_no_division_in_order_takes_less_time(se
         predicted = time([cell_for(sizes, mine) for sizes in own]) + cells.COMPILE_S * len(mine)
         alone = choose_cells(own[:1], times)
         assert len(alone) == 1
-        largest = np.max([-(-np.array(sizes[:4]) // cells.ROUNDED) * cells.ROUNDED for sizes in own], axis=0)
+        largest = np.max(
+            [-(-np.array(sizes[:4]) // cells.ROUNDED) * cells.ROUNDED for sizes in own], axis=0
+        )
         together = Sizes(*map(int, largest), kind)
         assert predicted <= time([together] * len(own)) + cells.COMPILE_S + 1e-9
 

@@ -88,13 +88,17 @@ def test_the_thread_that_closes_may_be_one_that_solves(monkeypatch):
     [
         ("break", ""),
         pytest.param("raise KeyError('mine')", "KeyError: 'mine'", marks=pytest.mark.slow),
-        pytest.param("signal.raise_signal(signal.SIGINT)", "KeyboardInterrupt", marks=pytest.mark.slow),
+        pytest.param(
+            "signal.raise_signal(signal.SIGINT)", "KeyboardInterrupt", marks=pytest.mark.slow
+        ),
         pytest.param("results.close()", "", marks=pytest.mark.slow),
     ],
 )
 def test_results_that_are_left_end_with_the_program_and_say_nothing(leave, said):
     code = LEFT.format(leave=leave)
-    done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, timeout=60
+    )
     assert done.stderr.count("Traceback") == bool(said)
     assert said in done.stderr
     assert "ignored" not in done.stderr

@@ -27,7 +27,9 @@ def test_a_training_knows_all_methods_of_the_package():
 
 def test_a_package_adds_a_method_by_an_entry_point(monkeypatch):
     added = EntryPoint("mine", "jaxba.methods.deeplm:GlobalConjugateGradients", methods.GROUP)
-    monkeypatch.setattr(methods, "entry_points", lambda group: [added] if group == methods.GROUP else [])
+    monkeypatch.setattr(
+        methods, "entry_points", lambda group: [added] if group == methods.GROUP else []
+    )
     monkeypatch.setattr(methods, "METHODS", type(METHODS)())
     assert make_method("mine") == GlobalConjugateGradients()
     with pytest.raises(InputError, match="known: lm, stba, deeplm, mine"):

@@ -21,13 +21,16 @@ NAMES = tuple(f"{letter}.jpg" for letter in "abcdef")
 
 
 def measured(off: np.ndarray, **more) -> jaxba.Solution:
-    """The solution of a scene whose images were measured with normal errors and so far off besides."""
+    """The solution of a scene whose images were measured with normal errors and so far off
+    besides."""
     problem = support.solved()
     count = problem.num_cameras
     labels = Labels(NAMES, 10 + np.arange(count), np.arange(count), np.arange(problem.num_points))
     noise = SIGMA * np.random.default_rng(7).normal(size=(count, 3))
     positions = geometry.camera_centers(problem.cameras) + noise + off
-    problem = jaxba.with_position_priors(problem.replace(labels=labels), positions, stddev=SIGMA, align=False, **more)
+    problem = jaxba.with_position_priors(
+        problem.replace(labels=labels), positions, stddev=SIGMA, align=False, **more
+    )
     return jaxba.solve(problem, "ceres", QUICK)
 
 
@@ -69,8 +72,8 @@ def test_positions_of_other_images_are_all_wrong():
 
 
 def test_what_is_left_of_rows_is_what_solves_of_other_measurements_leave():
-    """The change of all residuals with a number of one row, by two solves, is a column of the cofactors. Pixels and
-    positions are exact: curved residuals would change the slope."""
+    """The change of all residuals with a number of one row, by two solves, is a column of the
+    cofactors. Pixels and positions are exact: curved residuals would change the slope."""
     problem = measured(np.zeros((6, 3))).problem
     (rows,) = problem.residuals.rows
     centers = geometry.camera_centers(problem.cameras)
@@ -85,7 +88,9 @@ def test_what_is_left_of_rows_is_what_solves_of_other_measurements_leave():
         ends.append(residuals_of_rows(solution.problem)[0].ravel())
     none = np.zeros(problem.num_observations, bool)
     left, _ = left_of(problem, none, jaxba.Loss(), "free", Noise(1.0, 1.0))
-    np.testing.assert_allclose((ends[1] - ends[0]) / (2 * step), left.cofactor[:, 3 * 3 + 1], atol=1e-5)
+    np.testing.assert_allclose(
+        (ends[1] - ends[0]) / (2 * step), left.cofactor[:, 3 * 3 + 1], atol=1e-5
+    )
 
 
 def test_a_solve_without_iterations_says_nothing_of_what_fits():
@@ -102,12 +107,15 @@ def test_notes_of_problems_without_measurements_are_empty(count):
 
 @pytest.mark.slow
 def test_a_wrong_bar_that_the_pixels_give_way_to_is_named():
-    """Few images with lenses of their own: a point moves along its rays, and the bar has a tenth of its deviation."""
+    """Few images with lenses of their own: a point moves along its rays, and the bar has a tenth of
+    its deviation."""
     problem = measured(np.zeros((6, 3))).problem
     length = np.linalg.norm(problem.points[0] - problem.points[1])
     bar = jaxba.residuals.distance(point=[0], point_2=[1], length=1.2 * length, sigma=SIGMA)
     solution = jaxba.solve(jaxba.with_residual(problem, bar), "ceres", QUICK)
     assert np.abs(residuals_of_rows(solution.problem)[1]).max() < 0.5
     (note,) = solution.notes
-    (error,) = re.search(r"^distance: does not fit the rest: point 0 and point 1 is (-[\d.]+) or", note).groups()
+    (error,) = re.search(
+        r"^distance: does not fit the rest: point 0 and point 1 is (-[\d.]+) or", note
+    ).groups()
     assert float(error) == pytest.approx(-0.2 * length, rel=0.1)

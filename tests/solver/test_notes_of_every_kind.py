@@ -1,4 +1,5 @@
-"""Of every kind of measurement: right data have no note, and a gross error of one row has one that names the row."""
+"""Of every kind of measurement: right data have no note, and a gross error of one row has one that
+names the row."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ class Scene(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Rows of a residual, which row has the gross error, what a note calls it, and starts of blocks."""
+    """Rows of a residual, which row has the gross error, what a note calls it, and starts of
+    blocks."""
 
     rows: Rows
     name: str
@@ -71,7 +73,9 @@ def scene_and_start(rng: np.random.Generator) -> tuple[Scene, BundleProblem]:
     inside = np.einsum("nij,nj->ni", turns[camera], scene.points[point] - scene.centres[camera])
     pixels = FOCAL * inside[:, :2] / inside[:, 2:] * [1.0, -1.0]
     pixels += PIXEL * rng.standard_normal(pixels.shape)
-    start_turns = Rotation.from_rotvec(0.003 * rng.standard_normal((CAMERAS, 3))).as_matrix() @ turns
+    start_turns = (
+        Rotation.from_rotvec(0.003 * rng.standard_normal((CAMERAS, 3))).as_matrix() @ turns
+    )
     start_centres = scene.centres + 0.02 * rng.standard_normal((CAMERAS, 3))
     shift = -np.einsum("nij,nj->ni", start_turns, start_centres) @ COLMAP_AXES
     vectors = Rotation.from_matrix(COLMAP_AXES @ start_turns).as_rotvec()
@@ -80,7 +84,9 @@ def scene_and_start(rng: np.random.Generator) -> tuple[Scene, BundleProblem]:
     return scene, BundleProblem.create(cameras, points, pixels, camera, point)
 
 
-def noise(rng: np.random.Generator, count: int, row: int, gross: float) -> Float[np.ndarray, " count"]:
+def noise(
+    rng: np.random.Generator, count: int, row: int, gross: float
+) -> Float[np.ndarray, " count"]:
     """Standard normals, and a gross error in one of them."""
     values = rng.standard_normal(count)
     values[row] += gross
@@ -90,11 +96,15 @@ def noise(rng: np.random.Generator, count: int, row: int, gross: float) -> Float
 def depths(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """Maps of all images, each with a scale and a shift, at half of the points."""
     camera, point = np.divmod(np.arange(CAMERAS * POINTS // 2), POINTS // 2)
-    inside = np.einsum("nij,nj->ni", scene.turns[camera], scene.points[point] - scene.centres[camera])
+    inside = np.einsum(
+        "nij,nj->ni", scene.turns[camera], scene.points[point] - scene.centres[camera]
+    )
     row, sigma = 33, 0.05
     measured = 1.7 * inside[:, 2] + 0.3 + sigma * noise(rng, len(camera), row, gross)
     rows = residuals.depth(pose=camera, point=point, image=camera, measured=measured, sigma=sigma)
-    return Measurement(rows, f"camera {camera[row]} and point {point[row]}", {"image": np.tile([1.7, 0.0], (8, 1))})
+    return Measurement(
+        rows, f"camera {camera[row]} and point {point[row]}", {"image": np.tile([1.7, 0.0], (8, 1))}
+    )
 
 
 def distances(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
@@ -110,7 +120,9 @@ def distances(scene: Scene, rng: np.random.Generator, gross: float) -> Measureme
 def baselines(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """Distances between successive cameras."""
     first, row, sigma = np.arange(CAMERAS - 1), 2, 0.02
-    length = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1) + sigma * noise(rng, len(first), row, gross)
+    length = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1) + sigma * noise(
+        rng, len(first), row, gross
+    )
     rows = residuals.baseline(pose=first, pose_2=first + 1, length=length, sigma=sigma)
     return Measurement(rows, f"camera {row} and camera {row + 1}")
 
@@ -132,7 +144,9 @@ def odometry(scene: Scene, rng: np.random.Generator, gross: float) -> Measuremen
     error = sigma * rng.standard_normal((len(first), 6))
     error[row, 4] += sigma[4] * gross
     rotation = scene.turns[:-1] @ np.swapaxes(scene.turns[1:], 1, 2)
-    translation = np.einsum("nij,nj->ni", scene.turns[:-1], np.diff(scene.centres, axis=0)) + error[:, 3:]
+    translation = (
+        np.einsum("nij,nj->ni", scene.turns[:-1], np.diff(scene.centres, axis=0)) + error[:, 3:]
+    )
     rotation = rotation @ Rotation.from_rotvec(error[:, :3]).as_matrix()
     data = {"rotation": rotation, "translation": translation, "whitening": np.diag(1 / sigma)[None]}
     rows = residuals.relative_pose(pose=first, pose_2=first + 1, **data)
@@ -144,14 +158,20 @@ def inertial(scene: Scene, rng: np.random.Generator, gross: float) -> Measuremen
     time = np.arange(MOMENTS[-1] * RATE + 1) / RATE
     step = 1e-4
     rates = (attitude_at(time - step).inv() * attitude_at(time + step)).as_rotvec() / (2 * step)
-    force = (centre_at(time - step) - 2 * centre_at(time) + centre_at(time + step)) / step**2 - GRAVITY
+    force = (
+        centre_at(time - step) - 2 * centre_at(time) + centre_at(time + step)
+    ) / step**2 - GRAVITY
     force = attitude_at(time).inv().apply(force)
     white, walk = np.repeat(IMU_NOISE, 3).reshape(2, 6)
     interval = np.diff(MOMENTS)
     steps = walk * np.sqrt(interval)[:, None] * rng.standard_normal((CAMERAS - 1, 6))
     bias = np.vstack([np.zeros(6), np.cumsum(steps, axis=0)])
     now = np.minimum((time / interval[0]).astype(int), CAMERAS - 2)
-    samples = np.hstack([rates, force]) + bias[now] + white * np.sqrt(RATE) * rng.standard_normal((len(time), 6))
+    samples = (
+        np.hstack([rates, force])
+        + bias[now]
+        + white * np.sqrt(RATE) * rng.standard_normal((len(time), 6))
+    )
     data = residuals.preintegrated(time, samples[:, :3], samples[:, 3:], MOMENTS, noise=IMU_NOISE)
     first, row = np.arange(CAMERAS - 1), 3
     covariance = np.linalg.inv(data["whitening"][row].T @ data["whitening"][row])
@@ -179,7 +199,9 @@ def ranges(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     point, row, sigma = np.arange(2 * CAMERAS), 7, 0.02
     measured = np.linalg.norm(scene.points[point] - scene.centres[camera], axis=1) + 0.1
     measured += sigma * noise(rng, len(point), row, gross)
-    rows = range_finder(pose=camera, point=point, offset=np.zeros(len(point), int), measured=measured, sigma=sigma)
+    rows = range_finder(
+        pose=camera, point=point, offset=np.zeros(len(point), int), measured=measured, sigma=sigma
+    )
     return Measurement(rows, f"row {row} ", {"offset": np.zeros((1, 1))})
 
 
@@ -197,7 +219,8 @@ KINDS: dict[str, Draw] = {
 
 @functools.cache
 def notes_of(kind: str, seed: int, gross: float) -> tuple[tuple[str, ...], str]:
-    """Notes of a random survey, and the name of the row with an error of so many standard deviations."""
+    """Notes of a random survey, and the name of the row with an error of so many standard
+    deviations."""
     rng = np.random.default_rng([seed, sorted(KINDS).index(kind)])
     scene, problem = scene_and_start(rng)
     measured = KINDS[kind](scene, rng, gross)
@@ -217,7 +240,8 @@ QUICK = ("distance", "gravity")
 
 
 @pytest.mark.parametrize(
-    "kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+    "kind",
+    [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS],
 )
 def test_right_measurements_have_no_note_and_a_wrong_row_is_named(kind):
     assert notes_of(kind, 0, 0.0)[0] == ()

@@ -1,4 +1,5 @@
-"""Loops of one's own: what `prepare` gives is what `lm_step` and `solve_loop` take, and they make the same solve."""
+"""Loops of one's own: what `prepare` gives is what `lm_step` and `solve_loop` take, and they make
+the same solve."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def check_same(found: jaxba.BundleProblem, solution: jaxba.Solution) -> None:
 
 @pytest.mark.slow
 def test_a_loop_of_steps_written_by_hand_is_the_solve():
-    """With the rule of `Classic`: lambda is halved after a step with a good gain, doubled after any other."""
+    """With the rule of `Classic`: lambda is halved after a step with a good gain, doubled after any
+    other."""
     rule = jaxba.Classic(initial=0.01)
     solution = jaxba.solve(support.tiny(), rule, OPTIONS)
     prepared = prepare(support.tiny(), rule, OPTIONS)
@@ -44,11 +46,18 @@ def test_the_compiled_loop_is_the_solve(policy):
     solution = jaxba.solve(support.tiny(), policy, OPTIONS)
     prepared = prepare(support.tiny(), policy, OPTIONS)
     carry, history = solve_loop(
-        prepared.layout, prepared.state, prepared.policy, OPTIONS.tolerances, prepared.options, OPTIONS.max_iterations
+        prepared.layout,
+        prepared.state,
+        prepared.policy,
+        OPTIONS.tolerances,
+        prepared.options,
+        OPTIONS.max_iterations,
     )
     assert int(carry.iteration) == solution.iterations
     assert int(carry.termination) == solution.termination
-    np.testing.assert_allclose(history.cost[: solution.iterations], solution.history.cost, rtol=1e-8)
+    np.testing.assert_allclose(
+        history.cost[: solution.iterations], solution.history.cost, rtol=1e-8
+    )
     check_same(prepared.problem_at(carry.state), solution)
 
 
@@ -64,14 +73,18 @@ def test_two_problems_of_equal_shape_are_solved_at_once():
 
     def run(layout, state):
         policy, options = prepared[0].policy, prepared[0].options
-        return solve_loop(layout, state, policy, OPTIONS.tolerances, options, OPTIONS.max_iterations)
+        return solve_loop(
+            layout, state, policy, OPTIONS.tolerances, options, OPTIONS.max_iterations
+        )
 
     carries, _ = jax.jit(jax.vmap(run))(layouts, states)
     for k, problem in enumerate(problems):
         solution = jaxba.solve(problem, "ceres", OPTIONS)
         assert int(carries.iteration[k]) == solution.iterations
         np.testing.assert_allclose(carries.state.cost[k], solution.final_cost, rtol=1e-9)
-        check_same(prepared[k].problem_at(jax.tree.map(lambda leaf, k=k: leaf[k], carries.state)), solution)
+        check_same(
+            prepared[k].problem_at(jax.tree.map(lambda leaf, k=k: leaf[k], carries.state)), solution
+        )
 
 
 def test_the_compiled_loop_is_traced_once_for_all_numbers_of_a_policy_and_of_the_stop_rules():
@@ -80,10 +93,19 @@ def test_the_compiled_loop_is_traced_once_for_all_numbers_of_a_policy_and_of_the
     for seed, first, ftol in ((0, 1e-4, 1e-6), (1, 1e-2, 1e-3)):
         prepared = prepare(support.paper(seed), f"ceres:{first}", OPTIONS)
         tolerances = jax.tree.map(jnp.asarray, OPTIONS.tolerances._replace(ftol=ftol))
-        loop(prepared.layout, prepared.state, prepared.policy, tolerances, prepared.options, OPTIONS.max_iterations)
+        loop(
+            prepared.layout,
+            prepared.state,
+            prepared.policy,
+            tolerances,
+            prepared.options,
+            OPTIONS.max_iterations,
+        )
 
 
-@pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened, lambda: support.paper(0)])
+@pytest.mark.parametrize(
+    "make", [support.tiny, support.odd, support.whitened, lambda: support.paper(0)]
+)
 def test_the_start_comes_back_bit_by_bit(make):
     prepared = prepare(make(), "ceres")
     assert same_bits(prepared.problem_at(prepared.state), make())
@@ -117,8 +139,18 @@ def test_a_padded_problem_comes_back_in_its_own_sizes():
 
 def test_double_precision_without_64_bits_is_refused_in_one_line():
     prepared = prepare(support.tiny(), "ceres", OPTIONS)
-    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 needs 64 bits in JAX: call jax") as caught:
-        solve_loop(prepared.layout, prepared.state, prepared.policy, OPTIONS.tolerances, prepared.options, 3)
+    with (
+        jax.enable_x64(False),
+        pytest.raises(ValueError, match="float64 needs 64 bits in JAX: call jax") as caught,
+    ):
+        solve_loop(
+            prepared.layout,
+            prepared.state,
+            prepared.policy,
+            OPTIONS.tolerances,
+            prepared.options,
+            3,
+        )
     assert "\n" not in str(caught.value)
 
 

@@ -56,6 +56,8 @@ def test_a_solve_of_a_prepared_kind_compiles_no_step_and_begins_with_optimised_p
     jax.clear_caches()
     executable_cache._load.cache_clear()
     with Compilations() as seen:
-        solution = solve(wanted, "ceres+embedded", SolveOptions(max_iterations=3, compilation="auto", pad=True))
+        solution = solve(
+            wanted, "ceres+embedded", SolveOptions(max_iterations=3, compilation="auto", pad=True)
+        )
     assert not {"propose", "try_candidate", "camera_round"} & set(seen.names)
     assert solution.quick_iterations == 0

@@ -14,8 +14,12 @@ from jaxba.solver import progress
 @pytest.mark.parametrize("run", [jaxba.solve, jaxba.solve_and_retriangulate])
 def test_a_verbose_solve_prints_a_row_for_every_iteration_and_calls_back(run, capsys):
     seen = []
-    solution = run(support.tiny(), callback=lambda record: seen.append(record.iteration), verbose=True)
-    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line[:4].strip().isdigit()]
+    solution = run(
+        support.tiny(), callback=lambda record: seen.append(record.iteration), verbose=True
+    )
+    rows = [
+        line.split() for line in capsys.readouterr().out.splitlines() if line[:4].strip().isdigit()
+    ]
     assert [int(row[0]) for row in rows] == list(range(solution.iterations + 1))
     assert float(rows[0][1]) == pytest.approx(solution.initial_cost, rel=1e-6)
     assert float(rows[-1][1]) == pytest.approx(solution.final_cost, rel=1e-6)
@@ -37,7 +41,9 @@ def test_compilation_is_announced_where_it_takes_time(capsys, monkeypatch):
     assert dots.endswith("\n")
 
 
-def test_a_long_iteration_counts_its_seconds_on_a_terminal_beside_those_of_the_last_one(capsys, monkeypatch):
+def test_a_long_iteration_counts_its_seconds_on_a_terminal_beside_those_of_the_last_one(
+    capsys, monkeypatch
+):
     monkeypatch.setattr(progress, "BEAT_S", 0.001)
     monkeypatch.setattr(progress, "LONG_ITERATION_S", 0.0)
     waiting = progress.Printed()

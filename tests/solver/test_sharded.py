@@ -1,4 +1,5 @@
-"""A solve on several devices is that on one: every observation is on one device, and costs agree to rounding."""
+"""A solve on several devices is that on one: every observation is on one device, and costs agree to
+rounding."""
 
 from __future__ import annotations
 
@@ -50,20 +51,26 @@ def general() -> BundleProblem:
     spread = np.tile(np.diag([0.5, 2.0]), (problem.num_observations, 1, 1))
     parts = (cameras, *support.arrays(problem)[1:])
     found = BundleProblem.create(*parts, covariance=spread, lenses=Lenses(lens, free))
-    found = with_position_priors(found, geometry.camera_centers(cameras) + 0.01, 0.01 * np.eye(3), align=False)
+    found = with_position_priors(
+        found, geometry.camera_centers(cameras) + 0.01, 0.01 * np.eye(3), align=False
+    )
     return hold(found, poses=[2], points=[3, 17])
 
 
 def compare(problem: BundleProblem, policy: str, rtol: float = 1e-10, **options) -> jaxba.Solution:
     one, several = (
-        solve(problem, policy, SolveOptions(max_iterations=6, pad=False, devices=devices, **options))
+        solve(
+            problem, policy, SolveOptions(max_iterations=6, pad=False, devices=devices, **options)
+        )
         for devices in (None, DEVICES)
     )
     shared = min(len(one.history.cost), len(several.history.cost))
     assert shared >= 3
     np.testing.assert_allclose(several.history.cost[:shared], one.history.cost[:shared], rtol=rtol)
     if not problem.residuals:
-        np.testing.assert_allclose(geometry.cost(several.problem), several.final_cost, rtol=max(rtol, 1e-9))
+        np.testing.assert_allclose(
+            geometry.cost(several.problem), several.final_cost, rtol=max(rtol, 1e-9)
+        )
     return several
 
 
@@ -86,12 +93,17 @@ def bar(point, point_2, *, length):
 def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
     problem = support.tiny()
     camera, point = problem.camera_index[::5], problem.point_index[::5]
-    rows = depth(pose=camera, point=point, image=camera, measured=-geometry.depths(problem)[::5] * 1.01)
-    problem = jaxba.with_residual(problem, rows, unknowns={"image": np.ones((6, 1))}, loss=jaxba.Loss("huber"))
+    rows = depth(
+        pose=camera, point=point, image=camera, measured=-geometry.depths(problem)[::5] * 1.01
+    )
+    problem = jaxba.with_residual(
+        problem, rows, unknowns={"image": np.ones((6, 1))}, loss=jaxba.Loss("huber")
+    )
     centers = geometry.camera_centers(problem.cameras)
     measured = centers[[0, 1, 2, 3]] - centers[[1, 2, 3, 5]] + 0.01
     rows = apart(pose=[0, 1, 2, 3], pose_2=[1, 2, 3, 5], size=0, measured=measured)
-    problem = jaxba.with_residual(problem, rows, unknowns={"size": [[1.1]]})  # one number of all cameras
+    # one number of all cameras
+    problem = jaxba.with_residual(problem, rows, unknowns={"size": [[1.1]]})
     problem = jaxba.with_residual(problem, bar(point=[0, 1, 2], point_2=[3, 2, 9], length=60.0))
     several = compare(problem, "ceres", linear_solver="implicit")
     images, size = several.problem.residuals.blocks
@@ -137,9 +149,17 @@ def test_lenses_constants_and_priors_are_divided_too(linear_solver):
 
 @pytest.mark.parametrize(
     ("policy", "devices"),
-    [("ceres", None), *(pytest.param(*one, marks=pytest.mark.slow) for one in [("guarded", None), ("ceres", DEVICES)])],
+    [
+        ("ceres", None),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in [("guarded", None), ("ceres", DEVICES)]
+        ),
+    ],
 )
-def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(policy, devices, monkeypatch):
+def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(
+    policy, devices, monkeypatch
+):
     problem = general() if policy == "guarded" else sequence()
     options = SolveOptions(linear_solver="implicit", max_iterations=6, devices=devices)
     whole = solve(problem, policy, options)
@@ -152,7 +172,9 @@ def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(
     assert setup.shards.layout.slot_camera.shape[1] > 1  # of each device
     in_parts = solve(problem, policy, options)
     np.testing.assert_allclose(in_parts.history.cost, whole.history.cost, rtol=1e-9)
-    np.testing.assert_allclose(geometry.cost(in_parts.problem), geometry.cost(whole.problem), rtol=1e-9)
+    np.testing.assert_allclose(
+        geometry.cost(in_parts.problem), geometry.cost(whole.problem), rtol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -162,7 +184,9 @@ def test_parts_of_a_device_are_computed_one_after_the_other_with_the_same_costs(
     ids=["rows_of_one_part", "a_row_between_all_points"],
 )
 def test_rows_of_two_points_may_be_in_one_part_alone(first, second, policy, monkeypatch):
-    problem = jaxba.with_residual(sequence(), bar(point=first, point_2=second, length=60.0), loss=jaxba.Loss("huber"))
+    problem = jaxba.with_residual(
+        sequence(), bar(point=first, point_2=second, length=60.0), loss=jaxba.Loss("huber")
+    )
     options = SolveOptions(linear_solver="implicit", max_iterations=4)
     whole = solve(problem, policy, options)
     monkeypatch.setattr(sharded, "LARGE", 1)
@@ -187,11 +211,18 @@ def test_a_large_problem_of_many_cameras_has_a_part_at_least(monkeypatch):
 def test_a_callback_sees_the_same_iterations_and_stops():
     problem, records = sequence(), []
     options = SolveOptions(linear_solver="implicit", devices=DEVICES, max_iterations=6)
-    found = solve(problem, "ceres", options, callback=lambda record: records.append(record) or len(records) == 3)
+    found = solve(
+        problem,
+        "ceres",
+        options,
+        callback=lambda record: records.append(record) or len(records) == 3,
+    )
     assert found.iterations == 3
     assert found.termination.reason == "stopped by the caller"
     one = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=3))
-    np.testing.assert_allclose([record.step.cost for record in records], one.history.cost, rtol=1e-10)
+    np.testing.assert_allclose(
+        [record.step.cost for record in records], one.history.cost, rtol=1e-10
+    )
 
 
 def test_every_observation_is_on_one_device_and_each_has_its_share():
@@ -254,7 +285,13 @@ def start_two(file, *options: str, stderr: int = subprocess.STDOUT) -> list[subp
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", str(file), *options]
+    command = [
+        sys.executable,
+        "-c",
+        "from jaxba.cli.solve import main; main()",
+        str(file),
+        *options,
+    ]
     command += ["--linear-solver", "implicit", "--compilation", "full"]
     ends = ["--coordinator", address, "--processes", "2", "--process"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
@@ -266,7 +303,9 @@ def start_two(file, *options: str, stderr: int = subprocess.STDOUT) -> list[subp
 
 def run_two(file, output, *options: str) -> tuple[list[int], list[str]]:
     """Exit statuses of two processes that solve a file, and what they print."""
-    started = start_two(file, "--policy", "ceres", "--max-iterations", "4", "--output", str(output), *options)
+    started = start_two(
+        file, "--policy", "ceres", "--max-iterations", "4", "--output", str(output), *options
+    )
     try:
         printed = [process.communicate(timeout=240)[0].decode() for process in started]
     finally:
@@ -284,14 +323,21 @@ def test_two_processes_solve_as_one_and_end_together(tmp_path):
     assert statuses == [2, 2]
     assert "nowhere" in printed[0]
     (tmp_path / "more.yaml").write_text("distances: [{points: [0, 9], length: 2, stddev: 0.1}]\n")
-    statuses, printed = run_two(file, tmp_path / "out.txt", "--constraints", str(tmp_path / "more.yaml"))
+    statuses, printed = run_two(
+        file, tmp_path / "out.txt", "--constraints", str(tmp_path / "more.yaml")
+    )
     assert statuses == [0, 0], printed
     assert "4 iterations" in printed[0]
-    assert {line for line in printed[1].splitlines() if not line.startswith("[Gloo]")} <= {WAITING}  # Gloo is C++
+    # Gloo is C++
+    assert {line for line in printed[1].splitlines() if not line.startswith("[Gloo]")} <= {WAITING}
     bars = jaxba.residuals.distance(point=0, point_2=9, length=2.0, sigma=0.1)
     problem = jaxba.with_residual(jaxba.read_problem(file), bars)
-    one = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).costs["pixels"]
-    np.testing.assert_allclose(geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9)
+    one = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).costs[
+        "pixels"
+    ]
+    np.testing.assert_allclose(
+        geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9
+    )
     statuses, printed = run_two(file, tmp_path / "start.txt", "--seconds", "1e-6")
     assert statuses == [0, 0], printed
     assert "not converged: time limit" in printed[0]
@@ -302,7 +348,9 @@ def test_a_process_that_dies_ends_the_other_with_one_line(tmp_path):
     file = tmp_path / "scene.txt"
     jaxba.write_problem(sequence(), file)
     # lambda so large that no rule of stopping is met
-    started = start_two(file, "--policy", "constant:1e9", "--max-iterations", "1000000", stderr=subprocess.PIPE)
+    started = start_two(
+        file, "--policy", "constant:1e9", "--max-iterations", "1000000", stderr=subprocess.PIPE
+    )
     try:
         assert started[0].stdout is not None
         while started[0].stdout.readline().split()[:1] != [b"3"]:
@@ -326,4 +374,7 @@ def test_a_process_whose_fellows_never_start_ends_with_one_line():
     code += f"d.initialize('localhost:{port}', 2, 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
     assert done.returncode == 2
-    assert done.stderr.splitlines() == [WAITING, "error: not all processes of this run have started in 1 s"]
+    assert done.stderr.splitlines() == [
+        WAITING,
+        "error: not all processes of this run have started in 1 s",
+    ]

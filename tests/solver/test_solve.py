@@ -1,4 +1,5 @@
-"""Whole solves: how they end, what they promise, and that every way of running them is the same solve."""
+"""Whole solves: how they end, what they promise, and that every way of running them is the same
+solve."""
 
 from __future__ import annotations
 
@@ -54,24 +55,30 @@ def test_the_compiled_loop_and_the_stepwise_one_are_the_same_solve(policy):
     assert (compiled.iterations, compiled.accepted) == (watched.iterations, watched.accepted)
     costs = np.append(compiled.initial_cost, compiled.history.cost)
     assert compiled.history.accepted.all()
-    # two programs round costs differently, in the last three digits; a small decrease has as many fewer that are right
+    # two programs round costs differently, in the last three digits; a small decrease has as many
+    # fewer that are right
     wanted = {"gradient_max": 1e-6, "gain_ratio": 1e-6 + 1e-13 * costs[1:] / -np.diff(costs)}
     for name in compiled.history._fields:
         one, other = getattr(compiled.history, name), getattr(watched.history, name)
         assert len(one) == len(other) == compiled.iterations
         bound = wanted.get(name, 1e-8) * np.abs(other)
         assert (np.abs(one.astype(float) - other) <= bound).all(), name
-    np.testing.assert_allclose(compiled.problem.points, watched.problem.points, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        compiled.problem.points, watched.problem.points, rtol=1e-6, atol=1e-8
+    )
     assert [r.iteration for r in records] == list(range(1, watched.iterations + 1))
     assert [r.step.cost for r in records] == list(watched.history.cost)
     times = [r.time_s for r in records]
     assert times == sorted(times)
-    assert all(np.ndim(value) == 0 and not isinstance(value, jax.Array) for value in records[0].step)
+    assert all(
+        np.ndim(value) == 0 and not isinstance(value, jax.Array) for value in records[0].step
+    )
 
 
 @pytest.mark.slow
 def test_a_batch_of_solves_equals_a_loop_of_solves():
-    """Scenes end after different numbers of iterations; those that are done must rest while the others go on."""
+    """Scenes end after different numbers of iterations; those that are done must rest while the
+    others go on."""
     options, tolerances = StepOptions(), Tolerances()
     run = lambda layout, state: solve_loop(layout, state, Ceres(), tolerances, options, 30)
     pairs = [start(support.paper(seed)) for seed in range(8)]
@@ -87,13 +94,18 @@ def test_a_batch_of_solves_equals_a_loop_of_solves():
         assert np.array_equal(history.accepted, histories.accepted[k])
         np.testing.assert_allclose(histories.cost[k], history.cost, rtol=1e-8)
         np.testing.assert_allclose(carries.state.cost[k], carry.state.cost, rtol=1e-8)
-        np.testing.assert_allclose(carries.state.points[k], carry.state.points, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            carries.state.points[k], carry.state.points, rtol=1e-5, atol=1e-6
+        )
         assert not np.any(history.cost[count:])
     assert len(set(counts)) > 1
 
 
 def test_a_policy_and_its_name_are_the_same():
-    by_name, by_object = stepwise(support.tiny(), "classic:0.03"), stepwise(support.tiny(), Classic(initial=0.03))
+    by_name, by_object = (
+        stepwise(support.tiny(), "classic:0.03"),
+        stepwise(support.tiny(), Classic(initial=0.03)),
+    )
     assert np.array_equal(by_name.history.cost, by_object.history.cost)
 
 
@@ -170,7 +182,8 @@ def test_the_gradient_vanishes_at_an_exact_optimum():
 
 @pytest.mark.parametrize("cluster_cameras", [2, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_rejected_step_is_repeated_where_clusters_take_turns(cluster_cameras):
-    """With the same lambda the next clustering makes another step; a single cluster makes the same one for ever."""
+    """With the same lambda the next clustering makes another step; a single cluster makes the same
+    one for ever."""
     options = StepOptions(method=StochasticClusters(cluster_cameras=cluster_cameras))
     solution = stepwise(support.tiny(), "constant:1e30", options=options, max_iterations=5)
     assert solution.accepted == 0
@@ -197,10 +210,14 @@ def test_a_noise_free_scene_is_solved_to_zero():
 
 
 def test_a_rejected_step_never_converges_however_small_it_is():
-    """Under a lambda of 1e30 nothing moves: the cost changes by nothing and the step is shorter than any tolerance."""
+    """Under a lambda of 1e30 nothing moves: the cost changes by nothing and the step is shorter
+    than any tolerance."""
     solution = stepwise(support.tiny(), "constant:1e30")
     assert solution.history.step_norm[0] <= 1e-8
-    assert abs(solution.history.candidate_cost[0] - solution.initial_cost) <= 1e-6 * solution.initial_cost
+    assert (
+        abs(solution.history.candidate_cost[0] - solution.initial_cost)
+        <= 1e-6 * solution.initial_cost
+    )
     assert solution.accepted == 0
     assert solution.termination == Termination.STALLED
     assert solution.iterations == 1
@@ -260,13 +277,17 @@ def test_a_solve_ends_at_the_first_cost_that_is_good_enough(callback, monkeypatc
     # other programs sum in another order
     targets = (0.5 * (costs[0] + costs[1]), costs[2] * (1 + 1e-12))
     for target, iterations in zip(targets, (2, 3), strict=True):
-        solution = solve(support.tiny(), tolerances=Tolerances(target=float(target)), callback=callback)
+        solution = solve(
+            support.tiny(), tolerances=Tolerances(target=float(target)), callback=callback
+        )
         assert solution.termination == Termination.TARGET
         assert not solution.converged
         assert solution.iterations == iterations
         assert solution.final_cost <= target
     assert solution.compile_s == 0  # of the second
-    above = solve(support.tiny(), tolerances=Tolerances(target=0.9 * float(costs[-1])), callback=callback)
+    above = solve(
+        support.tiny(), tolerances=Tolerances(target=0.9 * float(costs[-1])), callback=callback
+    )
     assert above.termination == Termination.COST
 
 
@@ -292,7 +313,13 @@ def test_convergence_comes_before_the_wish_to_stop():
 def test_every_end_has_a_reason_for_a_person():
     reasons = [end.reason for end in Termination]
     assert len(set(reasons)) == len(reasons)
-    tests = {Termination.COST, Termination.STEP, Termination.GRADIENT, Termination.ROUNDING, Termination.WITHIN}
+    tests = {
+        Termination.COST,
+        Termination.STEP,
+        Termination.GRADIENT,
+        Termination.ROUNDING,
+        Termination.WITHIN,
+    }
     assert {end for end in Termination if end.converged} == tests
 
 
@@ -304,7 +331,10 @@ def check_promises(problem, solution) -> None:
         assert type(array) is np.ndarray
         assert array.dtype == np.float64
         assert np.isfinite(array).all()
-    assert all(type(getattr(solution, name)) is float for name in ("initial_cost", "final_cost", "setup_s", "total_s"))
+    assert all(
+        type(getattr(solution, name)) is float
+        for name in ("initial_cost", "final_cost", "setup_s", "total_s")
+    )
     history = solution.history
     assert all(type(field) is np.ndarray and len(field) == solution.iterations for field in history)
     assert solution.accepted == history.accepted.sum()
@@ -325,7 +355,9 @@ def test_the_final_cost_is_the_cost_of_the_returned_problem(make):
     check_promises(problem, solution)
     tiny = 1e-14 * solution.initial_cost
     np.testing.assert_allclose(solution.initial_cost, geometry.cost(problem), rtol=1e-10)
-    np.testing.assert_allclose(solution.final_cost, geometry.cost(solution.problem), rtol=1e-10, atol=tiny)
+    np.testing.assert_allclose(
+        solution.final_cost, geometry.cost(solution.problem), rtol=1e-10, atol=tiny
+    )
     assert solution.final_cost < 0.5 * solution.initial_cost
     assert all(np.array_equal(a, b) for a, b in zip(before, support.arrays(problem), strict=True))
 
@@ -340,19 +372,25 @@ def test_a_problem_of_jax_arrays_is_solved_like_one_of_numpy_arrays():
 
 
 @pytest.mark.parametrize(
-    "name", ["huber", *(pytest.param(x, marks=pytest.mark.slow) for x in ("soft_l1", "cauchy", "tukey"))]
+    "name",
+    ["huber", *(pytest.param(x, marks=pytest.mark.slow) for x in ("soft_l1", "cauchy", "tukey"))],
 )
 def test_the_final_cost_counts_the_loss(name):
     options = StepOptions(loss=Loss(name, 1.7))
     solution = stepwise(support.tiny(), options=options)
     check_promises(support.tiny(), solution)
     assert solution.converged
-    np.testing.assert_allclose(solution.initial_cost, support.cost(support.tiny(), options), rtol=1e-10)
-    np.testing.assert_allclose(solution.final_cost, support.cost(solution.problem, options), rtol=1e-10)
+    np.testing.assert_allclose(
+        solution.initial_cost, support.cost(support.tiny(), options), rtol=1e-10
+    )
+    np.testing.assert_allclose(
+        solution.final_cost, support.cost(solution.problem, options), rtol=1e-10
+    )
 
 
 def test_a_robust_loss_finds_the_scene_behind_wrong_matches():
-    """Ten observations off by 80 pixels: Cauchy's loss ends near the optimum without them, least squares does not."""
+    """Ten observations off by 80 pixels: Cauchy's loss ends near the optimum without them, least
+    squares does not."""
     clean = support.tiny()
     rng = np.random.default_rng(0)
     wrong = rng.choice(clean.num_observations, 10, replace=False)
@@ -365,7 +403,9 @@ def test_a_robust_loss_finds_the_scene_behind_wrong_matches():
         return 0.5 * float(np.sum(geometry.residuals(solution.problem)[right] ** 2))
 
     best = stepwise(clean).final_cost
-    robust = cost_of_the_right_ones(stepwise(spoiled, options=StepOptions(loss=Loss("cauchy", 1.7))))
+    robust = cost_of_the_right_ones(
+        stepwise(spoiled, options=StepOptions(loss=Loss("cauchy", 1.7)))
+    )
     squared = cost_of_the_right_ones(stepwise(spoiled))
     assert robust < 2 * best < squared
 
@@ -380,7 +420,11 @@ def test_what_nobody_observes_comes_back_bit_by_bit(policy):
     assert (len(lonely), len(unseen)) == (1, 2)
     assert solution.problem.cameras[lonely].tobytes() == problem.cameras[lonely].tobytes()
     assert solution.problem.points[unseen].tobytes() == problem.points[unseen].tobytes()
-    assert (solution.problem.points[problem.point_index] != problem.points[problem.point_index]).any(axis=1).all()
+    assert (
+        (solution.problem.points[problem.point_index] != problem.points[problem.point_index])
+        .any(axis=1)
+        .all()
+    )
 
 
 def test_the_minimum_is_that_of_scipy():
@@ -427,7 +471,9 @@ def test_nielsens_rule_starts_in_the_units_of_the_hessian_under_identity_scaling
     # rotations on the manifold, where jaxba takes the diagonal
     manifold = StepOptions(coordinates=Coordinates(scaling="identity", rotation="manifold"))
     jacobian = support.linear(support.tiny(), manifold)[1]
-    np.testing.assert_allclose(solution.history.damping[0], 1e-5 * np.sum(jacobian**2, axis=0).max(), rtol=1e-9)
+    np.testing.assert_allclose(
+        solution.history.damping[0], 1e-5 * np.sum(jacobian**2, axis=0).max(), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("solver", ["explicit", "implicit"])
@@ -449,8 +495,13 @@ def test_one_observation_is_solved_exactly():
 
 
 def test_the_automatic_choice_of_the_linear_solver_is_told():
-    assert stepwise(support.tiny(), linear_solver="auto", max_iterations=1).linear_solver == "explicit"
-    assert stepwise(support.tiny(), linear_solver="implicit", max_iterations=1).linear_solver == "implicit"
+    assert (
+        stepwise(support.tiny(), linear_solver="auto", max_iterations=1).linear_solver == "explicit"
+    )
+    assert (
+        stepwise(support.tiny(), linear_solver="implicit", max_iterations=1).linear_solver
+        == "implicit"
+    )
     asked = StepOptions(linear_solver="implicit")
     assert stepwise(support.tiny(), options=asked, max_iterations=1).linear_solver == "implicit"
 
@@ -466,7 +517,10 @@ def test_the_automatic_choice_of_the_linear_solver_is_told():
         ({"tolerances": Tolerances(gtol=-1.0)}, "gtol must not be negative"),
         ({"policy": None}, "policy must be the name of a policy or a policy, not None"),
         ({"policy": "cerse"}, "unknown damping policy"),
-        ({"policy": "learned", "coordinates": Coordinates(scaling="identity")}, "lambda as a factor on the diagonal"),
+        (
+            {"policy": "learned", "coordinates": Coordinates(scaling="identity")},
+            "lambda as a factor on the diagonal",
+        ),
         ({"linear_solver": "dense"}, "linear_solver must be one of"),
         ({"method": "stba", "dtype": "mixed"}, "mixed types are for plain LM"),
     ],
@@ -477,7 +531,9 @@ def test_what_makes_no_sense_is_refused_in_one_line(change, message, unchecked):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["ceres", "classic", "gtsam", "nielsen", "stba", "theseus", "gauss-newton"])
+@pytest.mark.parametrize(
+    "name", ["ceres", "classic", "gtsam", "nielsen", "stba", "theseus", "gauss-newton"]
+)
 def test_every_rule_solves_a_scene_that_starts_near_its_minimum(name):
     solution = stepwise(support.tiny(), make_policy(name))
     check_promises(support.tiny(), solution)

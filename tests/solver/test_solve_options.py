@@ -1,4 +1,5 @@
-"""The one table of defaults: what is asked for, what a policy brings, and what the command does with it."""
+"""The one table of defaults: what is asked for, what a policy brings, and what the command does
+with it."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ from jaxba.solver.prepare import DEFAULT_POLICY
 
 def test_every_default_of_the_command_is_that_of_the_options():
     command, options = Arguments(), SolveOptions()
-    plain = {field.name for field in fields(Arguments)} & {field.name for field in fields(SolveOptions)} - {"loss"}
+    plain = {field.name for field in fields(Arguments)} & {
+        field.name for field in fields(SolveOptions)
+    } - {"loss"}
     for name in plain - {"pad"}:
         assert getattr(command, name) == getattr(options, name), name
     assert (command.pad, options.pad) == ("auto", None)
@@ -53,11 +56,17 @@ def test_the_command_asks_for_the_same_step():
 
 @pytest.mark.parametrize("function", [jaxba.solve, jaxba.solve_and_retriangulate, jaxba.prepare])
 def test_who_chooses_lambda_is_the_same_everywhere(function):
-    assert inspect.signature(function).parameters["policy"].default == Arguments().policy == DEFAULT_POLICY
+    assert (
+        inspect.signature(function).parameters["policy"].default
+        == Arguments().policy
+        == DEFAULT_POLICY
+    )
 
 
 def test_a_solve_with_defaults_is_what_the_command_writes(tmp_path):
-    start, written, expected = (tmp_path / name for name in ("start.txt", "written.txt", "expected.txt"))
+    start, written, expected = (
+        tmp_path / name for name in ("start.txt", "written.txt", "expected.txt")
+    )
     write_problem(support.tiny(), start)
     assert run([str(start), "--output", str(written)]) == 0
     write_problem(jaxba.solve(read_problem(start)).problem, expected)
@@ -77,8 +86,12 @@ def test_a_loss_leaves_the_step_that_the_policy_was_trained_with():
 
 def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
     trained, loss = trained_step(make_policy("bold")), Loss("huber", 2.0)
-    spelled_out = SolveOptions(loss=loss, refinement=trained.refinement, coordinates=trained.coordinates)
-    found, expected = (jaxba.solve(support.tiny(), "bold", o) for o in (SolveOptions(loss=loss), spelled_out))
+    spelled_out = SolveOptions(
+        loss=loss, refinement=trained.refinement, coordinates=trained.coordinates
+    )
+    found, expected = (
+        jaxba.solve(support.tiny(), "bold", o) for o in (SolveOptions(loss=loss), spelled_out)
+    )
     chex.assert_trees_all_equal(found.history, expected.history, strict=True)
 
 
@@ -100,7 +113,9 @@ def test_a_rule_brings_a_plain_step():
 
 
 @pytest.mark.parametrize("name", ["ceres+embedded", "constant:1e-4+refine2", "learned+refine0"])
-def test_the_name_of_a_policy_brings_the_embedded_iterations_of_the_solver_of_that_name(name, tmp_path):
+def test_the_name_of_a_policy_brings_the_embedded_iterations_of_the_solver_of_that_name(
+    name, tmp_path
+):
     path, log = tmp_path / "problem.txt", tmp_path / "log.json"
     write_problem(support.tiny(), path)
     problem = read_problem(path)
@@ -118,19 +133,26 @@ def test_the_name_of_a_policy_brings_the_coordinates_unless_they_are_given():
     found = prepare(support.tiny(), "ceres+embedded").options
     assert (found.refinement, found.coordinates) == (built.refinement, built.coordinates)
     assert built.coordinates != Coordinates()
-    given = prepare(support.tiny(), "ceres+embedded", SolveOptions(coordinates=Coordinates())).options
+    given = prepare(
+        support.tiny(), "ceres+embedded", SolveOptions(coordinates=Coordinates())
+    ).options
     assert (given.refinement, given.coordinates) == (built.refinement, Coordinates())
 
 
 def test_options_may_repeat_the_name_of_the_policy_and_not_contradict_it(capsys):
     same = Refinement(points=3)
-    assert prepare(support.tiny(), "ceres+refine3", SolveOptions(refinement=same)).options.refinement == same
+    assert (
+        prepare(support.tiny(), "ceres+refine3", SolveOptions(refinement=same)).options.refinement
+        == same
+    )
     with pytest.raises(ValueError, match=r"policy 'ceres\+refine3' states its refinement"):
         jaxba.solve(support.tiny(), "ceres+refine3", SolveOptions(refinement=Refinement(points=2)))
     assert solve_options(Arguments(policy="ceres+refine3", refine_points=3))[1].refinement == same
     for policy in ("ceres+refine3", "ceres+embedded"):
         assert run(["--policy", policy, "--refine-points", "2"]) == 2
-        assert capsys.readouterr().err == f"error: --refine-points 2 contradicts --policy {policy}\n"
+        assert (
+            capsys.readouterr().err == f"error: --refine-points 2 contradicts --policy {policy}\n"
+        )
 
 
 # What is refused
@@ -148,7 +170,10 @@ def test_a_factorisation_that_does_not_fit_the_memory_is_refused(asked, monkeypa
     ("asked", "message"),
     [
         ({"dtype": "float16"}, "dtype must be one of float64, float32, mixed, not 'float16'"),
-        ({"linear_solver": "power"}, "linear_solver must be one of auto, explicit, sparse, implicit, cg, not 'power'"),
+        (
+            {"linear_solver": "power"},
+            "linear_solver must be one of auto, explicit, sparse, implicit, cg, not 'power'",
+        ),
         ({"compilation": "fast"}, "compilation must be one of"),
         ({"intrinsics": "shared"}, "intrinsics must be one of free, fixed, not 'shared'"),
         ({"method": "magic"}, "unknown method 'magic'; known: lm, stba, deeplm"),
@@ -168,14 +193,29 @@ def test_options_are_checked_where_they_are_made(asked, message, unchecked):
 
 @pytest.mark.parametrize("function", [jaxba.solve, jaxba.solve_and_retriangulate, jaxba.prepare])
 def test_options_that_are_none_are_refused(function, unchecked):
-    with pytest.raises(ValueError, match=r"options must be made with jaxba.SolveOptions, are 'ceres'"):
+    with pytest.raises(
+        ValueError, match=r"options must be made with jaxba.SolveOptions, are 'ceres'"
+    ):
         function(support.tiny(), options="ceres")
 
 
 def test_a_path_is_no_problem(unchecked):
-    with pytest.raises(ValueError, match=r"problem must be a BundleProblem, as jaxba.read_problem returns it, not 'a"):
+    with pytest.raises(
+        ValueError,
+        match=r"problem must be a BundleProblem, as jaxba.read_problem returns it, not 'a",
+    ):
         jaxba.solve("a.txt")
 
 
 def test_options_are_hashable_so_that_they_can_be_keys():
-    assert len({SolveOptions(), SolveOptions(), SolveOptions(method="deeplm"), SolveOptions(loss=Loss("huber"))}) == 3
+    assert (
+        len(
+            {
+                SolveOptions(),
+                SolveOptions(),
+                SolveOptions(method="deeplm"),
+                SolveOptions(loss=Loss("huber")),
+            }
+        )
+        == 3
+    )

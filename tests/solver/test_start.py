@@ -1,4 +1,5 @@
-"""A solve starts where residuals say that the scene is as a whole, wherever it was, unless something else says it."""
+"""A solve starts where residuals say that the scene is as a whole, wherever it was, unless
+something else says it."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ def truth() -> jaxba.BundleProblem:
     return jaxba.hold(problem, numbers=["focal", "distortion"])
 
 
-def somewhere(truth: jaxba.BundleProblem, scale: float, turn=(3.0, 0.3, 0.5)) -> jaxba.BundleProblem:
+def somewhere(
+    truth: jaxba.BundleProblem, scale: float, turn=(3.0, 0.3, 0.5)
+) -> jaxba.BundleProblem:
     """The scene of another size, place and attitude, and a little off."""
     start = jaxba.perturb(truth, 1, 0.002, 0.02, 0.02)
     place = scale * np.array([1.0, 2.0, 3.0])
@@ -53,7 +56,9 @@ def gravity(truth: jaxba.BundleProblem) -> jaxba.problem.residuals.Rows:
     return residuals.gravity(pose=EACH, direction=measured, up=UP, sigma=0.01)
 
 
-def control_points(truth: jaxba.BundleProblem, offset=(0.0, 0.0, 0.0)) -> jaxba.problem.residuals.Rows:
+def control_points(
+    truth: jaxba.BundleProblem, offset=(0.0, 0.0, 0.0)
+) -> jaxba.problem.residuals.Rows:
     place = truth.points[:8] + offset
     return residuals.control_point(point=np.arange(8), position=place, whitening=np.eye(3) / 0.01)
 
@@ -87,7 +92,9 @@ def test_what_fits_or_is_aligned_or_held_stays_as_it_is(truth):
 @pytest.mark.parametrize("origin", ["origin", "map"])
 @pytest.mark.parametrize("what", ["pose", "point"])
 def test_a_scene_is_scaled_about_what_is_held(what, origin, truth):
-    start = transformed(somewhere(truth, 50.0), Similarity(1.0, np.eye(3), np.array(ORIGINS[origin])))
+    start = transformed(
+        somewhere(truth, 50.0), Similarity(1.0, np.eye(3), np.array(ORIGINS[origin]))
+    )
     start = jaxba.hold(start, poses=[2]) if what == "pose" else jaxba.hold(start, points=[9])
     moved = as_measured(jaxba.with_residual(start, bars(truth)))
     assert lengths(moved) == pytest.approx(lengths(truth), rel=0.02)
@@ -119,7 +126,9 @@ def measured(name: str, truth: jaxba.BundleProblem) -> list[jaxba.problem.residu
     if name == "antennas":
         arm = np.array([0.1, 0.2, 0.3])
         place = centers[EACH] + np.einsum("nji,j->ni", colmap_rotations(truth)[EACH], arm)
-        return [residuals.position(pose=EACH, position=place, lever_arm=arm, whitening=100 * np.eye(3))]
+        return [
+            residuals.position(pose=EACH, position=place, lever_arm=arm, whitening=100 * np.eye(3))
+        ]
     return {
         "distances": [bars(truth)],
         "gravity": [gravity(truth)],

@@ -1,4 +1,5 @@
-"""A limit of time ends a solve after the iteration in which it is over, whatever runs the iterations.
+"""A limit of time ends a solve after the iteration in which it is over, whatever runs the
+iterations.
 
 The clock is the test's own: it stands still but where the test moves it."""
 
@@ -62,7 +63,9 @@ def busy_clock(monkeypatch):
 
 
 def limited(seconds: float | None, **options) -> SolveOptions:
-    return SolveOptions(tolerances=Tolerances(ftol=0.0, seconds=seconds), max_iterations=8, **options)
+    return SolveOptions(
+        tolerances=Tolerances(ftol=0.0, seconds=seconds), max_iterations=8, **options
+    )
 
 
 def in_parts(monkeypatch, problem) -> None:
@@ -74,7 +77,11 @@ def in_parts(monkeypatch, problem) -> None:
 def assert_is_start(solution, problem) -> None:
     assert solution.termination == Termination.TIME_LIMIT
     assert solution.iterations == solution.accepted == 0
-    assert solution.initial_cost == solution.final_cost == pytest.approx(geometry.cost(problem), rel=1e-9)
+    assert (
+        solution.initial_cost
+        == solution.final_cost
+        == pytest.approx(geometry.cost(problem), rel=1e-9)
+    )
     assert np.array_equal(solution.problem.cameras, problem.cameras)
     assert np.array_equal(solution.problem.points, problem.points)
     assert solution.notes == ()
@@ -90,7 +97,9 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in list(WAYS)[1:])])
+@pytest.mark.parametrize(
+    "way", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in list(WAYS)[1:])]
+)
 def test_a_solve_ends_after_the_iteration_in_which_the_time_is_over(way, clock, monkeypatch):
     problem = support.tiny()
     if way == "parts":
@@ -107,7 +116,9 @@ def test_a_solve_ends_after_the_iteration_in_which_the_time_is_over(way, clock, 
     assert found.final_cost < found.initial_cost
 
 
-@pytest.mark.parametrize("way", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in list(WAYS)[1:])])
+@pytest.mark.parametrize(
+    "way", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in list(WAYS)[1:])]
+)
 def test_the_limit_holds_without_a_callback(way, busy_clock, monkeypatch):
     problem = support.tiny()
     if way == "parts":
@@ -130,11 +141,16 @@ def test_a_limit_that_is_not_reached_changes_nothing_and_compiles_nothing(clock,
 
 def test_convergence_comes_before_the_end_of_the_time(clock):
     options = SolveOptions(tolerances=Tolerances(ftol=1.0, seconds=0.5))
-    assert solve(support.tiny(), SLOW, options, callback=clock.pass_second).termination == Termination.COST
+    assert (
+        solve(support.tiny(), SLOW, options, callback=clock.pass_second).termination
+        == Termination.COST
+    )
 
 
 @pytest.mark.parametrize("name", ["set_up", "as_measured"])
-def test_a_limit_below_the_set_up_gives_the_start_with_a_warning_and_compiles_no_step(name, clock, monkeypatch):
+def test_a_limit_below_the_set_up_gives_the_start_with_a_warning_and_compiles_no_step(
+    name, clock, monkeypatch
+):
     function = getattr(solving, name)
 
     def slow(*given, **named):
@@ -171,7 +187,10 @@ def test_without_iterations_there_is_no_time_to_limit(busy_clock):
 def test_a_checkpoint_goes_on_with_the_whole_limit(clock, tmp_path):
     file = tmp_path / "solve.npz"
     whole = solve(support.tiny(), SLOW, limited(None))
-    ends = [solve(support.tiny(), SLOW, limited(2.5), checkpoint=file, callback=clock.pass_second) for _ in range(3)]
+    ends = [
+        solve(support.tiny(), SLOW, limited(2.5), checkpoint=file, callback=clock.pass_second)
+        for _ in range(3)
+    ]
     assert [end.iterations for end in ends] == [3, 6, 8]
     assert [end.termination for end in ends[:2]] == [Termination.TIME_LIMIT] * 2
     assert ends[2].termination == Termination.MAX_ITERATIONS
@@ -219,7 +238,8 @@ def test_searches_for_points_share_the_limit(clock):
 
     plain = SolveOptions(compilation="quick", refinement=jaxba.Refinement(points=3))
     options = replace(plain, tolerances=Tolerances(seconds=0.5))
-    problem = support.strayed(-3.0, every=40)  # of which a point is left where it is until it is searched for
+    # of which a point is left where it is until it is searched for
+    problem = support.strayed(-3.0, every=40)
     found = jaxba.solve_and_retriangulate(problem, "ceres", options, on_search=search)
     assert len(searches) == 1
     assert found.iterations == solve(problem, "ceres", plain).iterations
@@ -237,7 +257,10 @@ def test_stages_of_a_rejecting_solve_share_the_limit_and_say_why_they_ended(cloc
     kept = found.problem.subset(~found.rejected)
     assert geometry.cost(kept) == pytest.approx(found.final_cost, rel=1e-9)
     stopped = jaxba.solve_graduated(
-        support.tiny(), SLOW, SolveOptions(compilation="quick"), callback=lambda record: record.iteration == 4
+        support.tiny(),
+        SLOW,
+        SolveOptions(compilation="quick"),
+        callback=lambda record: record.iteration == 4,
     )
     assert stopped.termination == Termination.STOPPED
     assert stopped.final_cost == pytest.approx(found.final_cost, rel=1e-9)

@@ -1,4 +1,5 @@
-"""Clusters of cameras: those that see the same points come together, and the coarse sums lose nothing."""
+"""Clusters of cameras: those that see the same points come together, and the coarse sums lose
+nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from jaxba.structure import agglomeration, camera_clusters
 from jaxba.structure.agglomeration import agglomerate, shared_points
 from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout
 
-sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))  # cameras, points, seed
+# cameras, points, seed
+sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))
 
 
 def clusters_of(layout: Layout) -> ClusterLayout:
@@ -44,16 +46,21 @@ def groups(label) -> set[frozenset[int]]:
 def test_shared_points_are_those_that_two_cameras_both_see(size):
     problem = random_views(*size)
     cameras, points = problem.num_cameras, problem.num_points
-    found, seen = shared_points(np.asarray(problem.camera_index), np.asarray(problem.point_index), cameras, points)
+    found, seen = shared_points(
+        np.asarray(problem.camera_index), np.asarray(problem.point_index), cameras, points
+    )
     sees = [set(problem.point_index[problem.camera_index == c].tolist()) for c in range(cameras)]
-    expected = [[0 if a == b else len(sees[a] & sees[b]) for b in range(cameras)] for a in range(cameras)]
+    expected = [
+        [0 if a == b else len(sees[a] & sees[b]) for b in range(cameras)] for a in range(cameras)
+    ]
     assert np.array_equal(found.toarray(), expected)
     assert np.array_equal(seen, [len(points) for points in sees])
     assert np.count_nonzero(found.data) == found.nnz
 
 
 def test_with_too_many_pairs_a_sample_of_the_points_is_counted(monkeypatch):
-    """Every fourth point instead of all: a quarter of what each two share, since here all see all."""
+    """Every fourth point instead of all: a quarter of what each two share, since here all see
+    all."""
     camera, point = np.tile(np.arange(5), 400), np.repeat(np.arange(400), 5)
     monkeypatch.setattr(agglomeration, "MAX_PRODUCTS", 400 * 25 / 4)
     found, _ = shared_points(camera, point, 5, 400)
@@ -64,7 +71,12 @@ def test_with_too_many_pairs_a_sample_of_the_points_is_counted(monkeypatch):
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.integers(1, 40), st.sampled_from([0.0, 0.03, 0.2, 1.0]), st.integers(1, 45), st.integers(0, 10**6))
+@given(
+    st.integers(1, 40),
+    st.sampled_from([0.0, 0.03, 0.2, 1.0]),
+    st.integers(1, 45),
+    st.integers(0, 10**6),
+)
 def test_labels_count_from_zero_and_there_are_no_more_than_asked_for(nodes, share, wanted, seed):
     rng = np.random.default_rng(seed)
     linked = np.triu(rng.random((nodes, nodes)) < share, 1) * rng.integers(1, 4, (nodes, nodes))
@@ -76,17 +88,22 @@ def test_labels_count_from_zero_and_there_are_no_more_than_asked_for(nodes, shar
 
 @pytest.mark.parametrize("seed", range(5))
 def test_two_far_groups_come_apart_however_the_cameras_are_numbered(seed):
-    """All of a group share ten points with each other; one camera of each group sees one point of the other's."""
+    """All of a group share ten points with each other; one camera of each group sees one point of
+    the other's."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(20)
     one, other = order[:12], order[12:]
     edges = {(a, b): 10.0 for group in (one, other) for a in group for b in group if a < b}
     edges[one[0], other[0]] = 1.0
-    assert groups(agglomerate(weights(20, edges), 20, 2)) == {frozenset(one.tolist()), frozenset(other.tolist())}
+    assert groups(agglomerate(weights(20, edges), 20, 2)) == {
+        frozenset(one.tolist()),
+        frozenset(other.tolist()),
+    }
 
 
 def test_a_sequence_is_cut_into_runs_of_neighbours():
-    """Cameras that are nearer share more: every cluster is a run without holes, of at most twice the mean."""
+    """Cameras that are nearer share more: every cluster is a run without holes, of at most twice
+    the mean."""
     edges = {(a, b): 1.0 * (6 - (b - a)) for a in range(64) for b in range(a + 1, min(a + 6, 64))}
     label = agglomerate(weights(64, edges), 64, 8)
     runs = groups(label)
@@ -123,7 +140,9 @@ def sum_by_levels(rows: np.ndarray, levels) -> np.ndarray:
     return rows
 
 
-def seen_by_cluster(layout: Layout, found: ClusterLayout, values: np.ndarray) -> dict[tuple[int, int], int]:
+def seen_by_cluster(
+    layout: Layout, found: ClusterLayout, values: np.ndarray
+) -> dict[tuple[int, int], int]:
     """Sum of the slots of each (column of the point, cluster), one slot after the other."""
     total = {}
     for slot in np.flatnonzero(layout.slot_mask):
@@ -135,8 +154,11 @@ def seen_by_cluster(layout: Layout, found: ClusterLayout, values: np.ndarray) ->
 @pytest.mark.parametrize("cluster_cameras", [1, 3, CLUSTER_CAMERAS])
 @settings(max_examples=25, deadline=None)
 @given(sizes, st.integers(0, 5))
-def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_cameras, size, duplicates):
-    """Random whole numbers as weights: a slot that is missing, doubled or in the wrong place changes a sum."""
+def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(
+    cluster_cameras, size, duplicates
+):
+    """Random whole numbers as weights: a slot that is missing, doubled or in the wrong place
+    changes a sum."""
     problem = random_views(*size, duplicates=duplicates)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
@@ -148,7 +170,9 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
     members = np.asarray(found.members)
     assert np.array_equal(np.sort(members[members < cameras]), np.arange(cameras))
     for number, row in enumerate(members):
-        assert np.array_equal(np.sort(row[row < cameras]), np.flatnonzero(np.asarray(found.label) == number))
+        assert np.array_equal(
+            np.sort(row[row < cameras]), np.flatnonzero(np.asarray(found.label) == number)
+        )
 
     rng = np.random.default_rng(size[2])
     values = np.where(layout.slot_mask, rng.integers(1, 1 << 20, layout.num_slots), 0)
@@ -167,9 +191,12 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
     assert pairs.table is not None
     chunks = (sums[pairs.left] * sums[pairs.right]).sum(axis=-1)
     assert np.array_equal(
-        sum_by_levels(support.batch_sums(pairs, chunks), pairs.levels)[np.asarray(pairs.table)], blocks
+        sum_by_levels(support.batch_sums(pairs, chunks), pairs.levels)[np.asarray(pairs.table)],
+        blocks,
     )
-    assert np.array_equal(np.asarray(pairs.block_camera)[np.diagonal(pairs.table)], np.arange(count))
+    assert np.array_equal(
+        np.asarray(pairs.block_camera)[np.diagonal(pairs.table)], np.arange(count)
+    )
 
 
 def test_there_are_never_more_clusters_than_the_limit(monkeypatch):
@@ -183,6 +210,8 @@ def test_clusters_are_made_only_where_the_two_level_preconditioner_is_asked_for(
     made = lambda **changes: build_layout(problem, StepOptions(**changes)).clusters is not None
     assert made(linear_solver="sparse")
     assert made(linear_solver="implicit")
-    assert not made(linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi"))
+    assert not made(
+        linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi")
+    )
     assert not made(linear_solver="explicit")
     assert not made(method=make_method("deeplm"))

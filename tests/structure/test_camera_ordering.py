@@ -1,4 +1,5 @@
-"""Orders of the cameras: a narrow band is found where there is one, and every block has one place in it."""
+"""Orders of the cameras: a narrow band is found where there is one, and every block has one place
+in it."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ from jaxba.structure.camera_ordering import (
 )
 from jaxba.structure.sum_trees import sorted_by
 
-graphs = st.tuples(st.integers(1, 40), st.sampled_from([0.0, 0.05, 0.2, 1.0]), st.integers(0, 10**6))
+graphs = st.tuples(
+    st.integers(1, 40), st.sampled_from([0.0, 0.05, 0.2, 1.0]), st.integers(0, 10**6)
+)
 
 
 def random_graph(cameras: int, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +41,9 @@ def band_graph(cameras: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reach_by_brute_force(rows, columns, rank) -> int:
-    return max((abs(int(rank[a]) - int(rank[b])) for a, b in zip(rows, columns, strict=True)), default=0)
+    return max(
+        (abs(int(rank[a]) - int(rank[b])) for a, b in zip(rows, columns, strict=True)), default=0
+    )
 
 
 # The order
@@ -66,7 +71,9 @@ def test_integers_are_sorted_stably(most):
 
 @settings(max_examples=100, deadline=None)
 @given(graphs)
-def test_ranks_are_a_permutation_with_the_reach_that_is_told_and_no_worse_than_the_given_order(graph):
+def test_ranks_are_a_permutation_with_the_reach_that_is_told_and_no_worse_than_the_given_order(
+    graph,
+):
     cameras = graph[0]
     rows, columns = random_graph(*graph)
     rank, reach = camera_order(rows, columns, cameras)
@@ -103,9 +110,12 @@ def test_an_order_that_is_best_already_stays():
 
 
 def test_two_sequences_that_take_turns_are_laid_one_after_the_other():
-    """Cameras 0, 2, 4, ... and 1, 3, 5, ... see nothing in common: each is a band of 3, together one of 6."""
+    """Cameras 0, 2, 4, ... and 1, 3, 5, ... see nothing in common: each is a band of 3, together
+    one of 6."""
     row, column = band_graph(40, 3)
-    rank, reach = camera_order(np.append(2 * row, 2 * row + 1), np.append(2 * column, 2 * column + 1), 80)
+    rank, reach = camera_order(
+        np.append(2 * row, 2 * row + 1), np.append(2 * column, 2 * column + 1), 80
+    )
     assert reach == 3
     assert np.ptp(rank[::2]) == np.ptp(rank[1::2]) == 39
 
@@ -141,7 +151,9 @@ def test_every_block_has_exactly_its_place_and_every_camera_too(graph, tile):
     count = len(names)
     assert np.array_equal(np.sort(np.asarray(band.blocks)[band.blocks < count]), np.arange(count))
     assert (np.asarray(band.blocks)[band.blocks >= count] == count).all()
-    assert places(band, count) == {number: divmod(int(name), cameras) for number, name in enumerate(names)}
+    assert places(band, count) == {
+        number: divmod(int(name), cameras) for number, name in enumerate(names)
+    }
 
 
 def places(band: Band, count: int) -> dict[int, tuple[int, int]]:

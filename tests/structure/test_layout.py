@@ -23,10 +23,13 @@ from jaxba.structure.track_buckets import MAX_PADDING, TILE, TILED_POINTS
 
 
 def problem_of(tracks: np.ndarray, cameras: int, seed: int, duplicates: int = 0) -> BundleProblem:
-    """Every point seen by `tracks[i]` different cameras, observations in random order; some are there twice."""
+    """Every point seen by `tracks[i]` different cameras, observations in random order; some are
+    there twice."""
     rng = np.random.default_rng(seed)
     point = np.repeat(np.arange(len(tracks)), tracks)
-    camera = np.concatenate([rng.choice(cameras, t, replace=False) for t in tracks] or [np.zeros(0)]).astype(int)
+    camera = np.concatenate(
+        [rng.choice(cameras, t, replace=False) for t in tracks] or [np.zeros(0)]
+    ).astype(int)
     again = rng.integers(len(point), size=duplicates)
     point, camera = np.concatenate([point, point[again]]), np.concatenate([camera, camera[again]])
     order = rng.permutation(len(point))
@@ -45,7 +48,9 @@ def track_lengths(draw) -> tuple[np.ndarray, int]:
     rng = np.random.default_rng(draw(st.integers(0, 10**6)))
     points = draw(st.integers(1, 400))
     longest = draw(st.sampled_from([1, 2, 5, 30, 200, 600]))
-    kind = draw(st.sampled_from(["equal", "uniform", "geometric", "power law", "few giants", "many zeros"]))
+    kind = draw(
+        st.sampled_from(["equal", "uniform", "geometric", "power law", "few giants", "many zeros"])
+    )
     lengths = {
         "equal": np.full(points, longest),
         "uniform": rng.integers(0, longest + 1, points),
@@ -100,7 +105,9 @@ def test_every_observation_is_in_exactly_one_slot(case, duplicates):
     columns = points_of(layout)
     seen = np.unique(problem.point_index)
     assert np.array_equal(np.sort(columns[columns < problem.num_points]), seen)
-    assert np.array_equal(layout.camera_seen, np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0)
+    assert np.array_equal(
+        layout.camera_seen, np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
+    )
     assert layout.num_slots == sum(prod(bucket) for bucket in layout.buckets)
     assert layout.num_points == len(columns)
 
@@ -124,7 +131,8 @@ def test_tiles_stay_within_that_tenth():
 
 @pytest.mark.parametrize("longest", [300, 900])
 def test_long_tails_need_few_buckets(longest):
-    """Every bucket costs compilation: a smooth distribution of lengths up to hundreds needs a dozen or two."""
+    """Every bucket costs compilation: a smooth distribution of lengths up to hundreds needs a dozen
+    or two."""
     lengths = np.clip((np.random.default_rng(0).pareto(1.2, 4000) * 2 + 2).astype(int), 2, longest)
     layout = build_layout(problem_of(lengths, longest, seed=1), NO_SYSTEM)
     assert len(layout.buckets) <= 25
@@ -157,7 +165,8 @@ def test_one_observation_is_enough():
 
 @pytest.mark.parametrize("length", [2, 5])
 def test_a_large_bucket_is_cut_into_tiles(length):
-    """With slots of a tile side by side, a point of padding or more at its end, and every sum as it was."""
+    """With slots of a tile side by side, a point of padding or more at its end, and every sum as it
+    was."""
     problem = problem_of(np.full(3 * TILED_POINTS, length), 9, seed=1)
     layout = build_layout(problem, NO_SYSTEM)
     assert layout.buckets == ((3 * TILED_POINTS // TILE + 1, length, TILE),)
@@ -188,7 +197,11 @@ sizes = st.one_of(st.just(0), st.integers(0, 12), st.integers(60, 70), st.intege
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(sizes, min_size=1, max_size=12), st.sampled_from([1, 2, 3, 8, 64]), st.integers(0, 10**6))
+@given(
+    st.lists(sizes, min_size=1, max_size=12),
+    st.sampled_from([1, 2, 3, 8, 64]),
+    st.integers(0, 10**6),
+)
 def test_a_sum_tree_sums_every_target_once(counts, width, seed):
     counts = np.array(counts)
     rng = np.random.default_rng(seed)
@@ -245,7 +258,8 @@ def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():
 
 
 def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
-    """Sum over the listed pairs of the product of their slots' weights, per block of the lower triangle."""
+    """Sum over the listed pairs of the product of their slots' weights, per block of the lower
+    triangle."""
     covisibility = layout.pairs
     weights = support.by_camera(layout, np.where(layout.slot_mask, weights, 0))
     chunks = (weights[covisibility.left] * weights[covisibility.right]).sum(axis=-1)
@@ -254,8 +268,11 @@ def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
     return summed(partial, covisibility.levels)[np.asarray(covisibility.table)]
 
 
-def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.ndarray) -> np.ndarray:
-    """Products of all ordered pairs of observations of one point, kept where row camera >= column camera."""
+def blocks_by_brute_force(
+    problem: BundleProblem, layout: Layout, weights: np.ndarray
+) -> np.ndarray:
+    """Products of all ordered pairs of observations of one point, kept where row camera >= column
+    camera."""
     found = np.zeros((problem.num_cameras, problem.num_cameras))
     slots = np.flatnonzero(layout.slot_mask)
     camera, point = layout.slot_camera[slots], layout.slot_point[slots]
@@ -275,7 +292,8 @@ def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.nd
     st.sampled_from([2, 7, 2048]),
 )
 def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch):
-    """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
+    """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block
+    changes a sum."""
     rng = np.random.default_rng(seed)
     tracks = np.append(1, rng.integers(0, cameras + 1, points))
     problem = problem_of(tracks, cameras, seed, duplicates)
@@ -283,7 +301,9 @@ def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points,
         patch.setattr(covisibility, "PAIR_BATCH", batch)
         layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
-    assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
+    assert np.array_equal(
+        blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights)
+    )
 
 
 def test_pairs_of_constant_cameras_are_not_listed():
@@ -317,9 +337,14 @@ def test_diagonal_blocks_know_their_camera_and_the_others_know_they_have_none():
     problem = support.odd()
     covisibility = build_layout(problem, grid=False).pairs
     cameras = problem.num_cameras
-    assert np.array_equal(np.asarray(covisibility.block_camera)[np.diagonal(covisibility.table)], np.arange(cameras))
+    assert np.array_equal(
+        np.asarray(covisibility.block_camera)[np.diagonal(covisibility.table)], np.arange(cameras)
+    )
     row, column = np.tril_indices(cameras, -1)
-    assert (np.asarray(covisibility.block_camera)[np.asarray(covisibility.table)[row, column]] == cameras).all()
+    assert (
+        np.asarray(covisibility.block_camera)[np.asarray(covisibility.table)[row, column]]
+        == cameras
+    ).all()
 
 
 def test_pairs_are_listed_only_on_demand():
@@ -332,7 +357,9 @@ def test_a_grid_names_the_slot_of_every_view_and_an_empty_one_elsewhere():
     assert layout.grid is not None
     assert layout.pairs is None
     column = np.asarray(layout.points)
-    seen = {(int(p), int(c)) for p, c in zip(problem.point_index, problem.camera_index, strict=True)}
+    seen = {
+        (int(p), int(c)) for p, c in zip(problem.point_index, problem.camera_index, strict=True)
+    }
     for row, views in enumerate(np.asarray(layout.grid)):
         for camera, slot in enumerate(views):
             assert bool(layout.slot_mask[slot]) == ((int(column[row]), camera) in seen)

@@ -61,8 +61,13 @@ SMALL = Capacity(cameras=8, points=64, observations=512, pairs=4096)
 
 def windows(count: int, cameras: int = 10) -> list:
     """Neighbouring cameras of a sequence."""
-    scene = random_scene(SceneConfig(40, 900, 3600, max_depth=4.0, gap_share=0.1, revisit_share=0.0), 0)
-    return [sub_problem(scene, np.arange(first, first + cameras)) for first in np.linspace(0, 30, count).astype(int)]
+    scene = random_scene(
+        SceneConfig(40, 900, 3600, max_depth=4.0, gap_share=0.1, revisit_share=0.0), 0
+    )
+    return [
+        sub_problem(scene, np.arange(first, first + cameras))
+        for first in np.linspace(0, 30, count).astype(int)
+    ]
 
 
 def mates(dense: bool) -> tuple:
@@ -73,15 +78,24 @@ def mates(dense: bool) -> tuple:
         other = other.replace(points=extra)
     else:
         fewer = [sub_problem(window, np.arange(9)) for window in windows(31)]
-        others = [other.replace(cameras=np.vstack([other.cameras, np.ones((2, 9))])) for other in fewer]
-        differ = lambda a, b: a.num_points != b.num_points and a.num_observations != b.num_observations
+        others = [
+            other.replace(cameras=np.vstack([other.cameras, np.ones((2, 9))])) for other in fewer
+        ]
+        differ = lambda a, b: (
+            a.num_points != b.num_points and a.num_observations != b.num_observations
+        )
         one, other = next(
-            (a, b) for a in windows(31) for b in others if capacity_of(a) == capacity_of(b) and differ(a, b)
+            (a, b)
+            for a in windows(31)
+            for b in others
+            if capacity_of(a) == capacity_of(b) and differ(a, b)
         )
     assert capacity_of(one) == capacity_of(other)
     sizes = [(p.num_cameras, p.num_points, p.num_observations) for p in (one, other)]
     assert all(a != b for a, b in zip(*sizes, strict=True))
-    assert all((build_layout(p, capacity=capacity_of(p)).grid is not None) == dense for p in (one, other))
+    assert all(
+        (build_layout(p, capacity=capacity_of(p)).grid is not None) == dense for p in (one, other)
+    )
     return one, other
 
 
@@ -96,7 +110,8 @@ def stepwise(problem, policy="ceres", options=None, **settings):
 
 
 BATCHES = st.sampled_from([3, 40, 2048])
-"""Chunks of pairs that are multiplied at once; with the last of these small problems have one batch."""
+"""Chunks of pairs that are multiplied at once; with the last of these small problems have one
+batch."""
 
 # The grid
 
@@ -121,7 +136,8 @@ def test_cameras_are_rounded_up_to_the_next_size(count, room):
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 3000), st.integers(1, 9))
 def test_slots_are_rounded_up_by_half_at_most_and_by_a_quarter_if_there_are_many(points, length):
-    """Points of equal tracks need as many slots as the next even number of observations, and one chunk is empty."""
+    """Points of equal tracks need as many slots as the next even number of observations, and one
+    chunk is empty."""
     problem = problem_of(np.full(points, length), 9, seed=0)
     needed = (length + length % 2) * points + 2
     found = capacity_of(problem).observations
@@ -132,9 +148,13 @@ def test_slots_are_rounded_up_by_half_at_most_and_by_a_quarter_if_there_are_many
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 40), st.integers(1, 3000), st.integers(0, 50))
-def test_a_capacity_holds_its_problem_and_no_more_than_the_next_size(seed, cameras, points, duplicates):
+def test_a_capacity_holds_its_problem_and_no_more_than_the_next_size(
+    seed, cameras, points, duplicates
+):
     rng = np.random.default_rng(seed)
-    problem = problem_of(np.append(1, rng.integers(0, min(cameras, 9) + 1, points)), cameras, seed, duplicates)
+    problem = problem_of(
+        np.append(1, rng.integers(0, min(cameras, 9) + 1, points)), cameras, seed, duplicates
+    )
     found = capacity_of(problem)
     layout = build_layout(problem, grid=False)
     seen = support.by_camera(layout, layout.slot_mask)
@@ -155,7 +175,11 @@ def test_a_capacity_holds_its_problem_and_no_more_than_the_next_size(seed, camer
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.integers(0, 40), min_size=1, max_size=12), st.sampled_from([1, 3, 8, 16]), st.integers(0, 10**6))
+@given(
+    st.lists(st.integers(0, 40), min_size=1, max_size=12),
+    st.sampled_from([1, 3, 8, 16]),
+    st.integers(0, 10**6),
+)
 def test_a_tree_with_room_sums_every_target_once_in_one_shape(counts, width, seed):
     counts = np.array(counts)
     rng = np.random.default_rng(seed)
@@ -171,7 +195,11 @@ def test_a_tree_with_room_sums_every_target_once_in_one_shape(counts, width, see
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.integers(0, 40), min_size=1, max_size=12), st.sampled_from([0, 1]), st.integers(0, 10**6))
+@given(
+    st.lists(st.integers(0, 40), min_size=1, max_size=12),
+    st.sampled_from([0, 1]),
+    st.integers(0, 10**6),
+)
 def test_ranks_sum_every_target_once(counts, first, seed):
     counts = np.sort(counts)[::-1]
     rng = np.random.default_rng(seed)
@@ -179,7 +207,11 @@ def test_ranks_sum_every_target_once(counts, first, seed):
     rows = np.append(rng.integers(-1000, 1000, counts.sum()), 0)
     expected, start = np.zeros(len(counts), int), np.cumsum(counts) - counts
     rank = np.arange(len(items)) - np.repeat(start, counts)
-    np.add.at(expected, np.repeat(np.arange(len(counts)), counts)[rank >= first], rows[items[rank >= first]])
+    np.add.at(
+        expected,
+        np.repeat(np.arange(len(counts)), counts)[rank >= first],
+        rows[items[rank >= first]],
+    )
     levels = prefix_levels(items, counts, empty, Room(500, 45), first)
     found = sum_by_ranks(rows, levels)
     assert np.array_equal(found, expected[: len(found)])
@@ -188,15 +220,19 @@ def test_ranks_sum_every_target_once(counts, first, seed):
 
 @pytest.mark.parametrize("most", [3, 9, 33])
 def test_ranks_of_usual_counts_have_one_shape(most):
-    """Counts that fall with the square of the rank; and some that do not, which get longer prefixes."""
+    """Counts that fall with the square of the rank; and some that do not, which get longer
+    prefixes."""
     usual = [np.sort(np.minimum(most, np.arange(200) // step))[::-1] for step in (40, 50)]
     shapes_of = lambda counts: [
-        level.shape for level in prefix_levels(np.arange(counts.sum()), counts, 2000, Room(2000, 33))
+        level.shape
+        for level in prefix_levels(np.arange(counts.sum()), counts, 2000, Room(2000, 33))
     ]
     few = np.zeros(200, int)
     assert shapes_of(usual[0]) == shapes_of(usual[1]) == shapes_of(few)
     few[:60] = 33
-    assert [b >= a for (_, a), (_, b) in zip(shapes_of(usual[0]), shapes_of(few), strict=True)] == [True] * 7
+    assert [b >= a for (_, a), (_, b) in zip(shapes_of(usual[0]), shapes_of(few), strict=True)] == [
+        True
+    ] * 7
     assert shapes_of(few) != shapes_of(usual[0])
 
 
@@ -212,9 +248,13 @@ def test_a_tree_without_room_is_refused():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.integers(1, 60), st.integers(0, 6), BATCHES)
-def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, cameras, points, duplicates, batch):
+def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(
+    seed, cameras, points, duplicates, batch
+):
     rng = np.random.default_rng(seed)
-    problem = problem_of(np.append(1, rng.integers(0, cameras + 1, points)), cameras, seed, duplicates)
+    problem = problem_of(
+        np.append(1, rng.integers(0, cameras + 1, points)), cameras, seed, duplicates
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(covisibility, "PAIR_BATCH", batch)
         layout = build_layout(problem, grid=False, capacity=SMALL)
@@ -227,14 +267,17 @@ def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, ca
     support.check_sums(layout, rng)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     found = blocks_by_layout(layout, weights)
-    assert np.array_equal(found[:cameras, :cameras], blocks_by_brute_force(problem, layout, weights))
+    assert np.array_equal(
+        found[:cameras, :cameras], blocks_by_brute_force(problem, layout, weights)
+    )
     assert not found[cameras:].any()
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 10**6), st.booleans(), st.sampled_from([3, 2048]))
 def test_shapes_follow_from_the_capacity_alone(one, other, grid, batch):
-    """Random sub-problems: any cameras, any points. Where the whole may be one dense product, it is so for both."""
+    """Random sub-problems: any cameras, any points. Where the whole may be one dense product, it is
+    so for both."""
     made = []
     for seed in (one, other):
         rng = np.random.default_rng(seed)
@@ -255,7 +298,9 @@ def test_windows_of_a_sequence_share_shapes_wherever_they_share_a_cell():
         capacity = capacity_of(problem)
         layout = build_layout(problem, StepOptions(), capacity)
         start = padded_parameters(problem, capacity)
-        state = jax.eval_shape(lambda *start, layout=layout: state_of(layout, *start, StepOptions()), *start)
+        state = jax.eval_shape(
+            lambda *start, layout=layout: state_of(layout, *start, StepOptions()), *start
+        )
         seen.setdefault((capacity, layout.grid is None), []).append(shapes((layout, state)))
     assert all(made == same[0] for same in seen.values() for made in same)
     assert len(seen) <= 6
@@ -284,11 +329,14 @@ def test_an_empty_slot_that_is_not_a_number_spoils_no_point():
     """As where a trial sends the first point, to which empty slots belong, out of range."""
     layout = build_layout(problem_of(np.full(9, 3), 4, seed=0), capacity=SMALL)
     values = np.where(layout.slot_mask, 1.0, np.nan)[None]
-    assert np.array_equal(point_sum(layout, jnp.asarray(values))[0], np.append(np.full(9, 3.0), np.zeros(55)))
+    assert np.array_equal(
+        point_sum(layout, jnp.asarray(values))[0], np.append(np.full(9, 3.0), np.zeros(55))
+    )
 
 
 def test_a_problem_larger_than_the_capacity_is_refused():
-    problem = problem_of(np.full(64, 8), 8, seed=0)  # 512 observations, and none of the 512 slots would be empty
+    # 512 observations, and none of the 512 slots would be empty
+    problem = problem_of(np.full(64, 8), 8, seed=0)
     with pytest.raises(ValueError, match="larger than the capacity: 8 cameras, 64 points"):
         build_layout(problem, capacity=SMALL)
 
@@ -320,12 +368,17 @@ KINDS = {
     "tiny": (support.tiny, StepOptions()),
     "dense product": (lambda: support.paper(0), StepOptions()),
     "loss": (support.tiny, StepOptions(loss=Loss("huber", 1.7))),
-    "embedded": (support.odd, StepOptions(refinement=Refinement(points=3, camera_rounds=2, trials=3, pattern_moves=2))),
+    "embedded": (
+        support.odd,
+        StepOptions(refinement=Refinement(points=3, camera_rounds=2, trials=3, pattern_moves=2)),
+    ),
     "fixed intrinsics": (support.tiny, StepOptions(intrinsics="fixed")),
 }
 
 
-@pytest.mark.parametrize("kind", [pytest.param(x, marks=pytest.mark.slow if x in SLOW_KINDS else ()) for x in KINDS])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(x, marks=pytest.mark.slow if x in SLOW_KINDS else ()) for x in KINDS]
+)
 def test_a_padded_solve_equals_the_one_of_the_given_sizes(kind):
     make, options = KINDS[kind]
     check_same(stepwise(make(), "ceres", options, pad=True), stepwise(make(), "ceres", options))
@@ -333,7 +386,8 @@ def test_a_padded_solve_equals_the_one_of_the_given_sizes(kind):
 
 @pytest.mark.slow
 def test_in_mixed_arithmetic_it_is_the_same_to_float32():
-    """The preconditioner is a factorisation in float32, behind which conjugate gradients stop at 1e-3."""
+    """The preconditioner is a factorisation in float32, behind which conjugate gradients stop at
+    1e-3."""
     padded, plain = (stepwise(support.tiny(), dtype="mixed", pad=pad) for pad in (True, False))
     check_same(padded, plain, rtol=float(np.finfo(np.float32).eps))
 
@@ -347,7 +401,9 @@ def test_policies_see_the_true_problem(policy):
 
 @pytest.mark.slow
 def test_a_band_is_factored_dense_to_the_same_end():
-    scene = random_scene(SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
+    scene = random_scene(
+        SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0
+    )
     padded, plain = (stepwise(scene, max_iterations=4, pad=pad) for pad in (True, False))
     assert build_layout(scene, StepOptions()).pairs.band is not None
     check_same(padded, plain)
@@ -365,7 +421,11 @@ def test_what_nobody_observes_comes_back_bit_by_bit_and_the_rest_moves():
     assert solution.problem.points.shape == problem.points.shape
     assert solution.problem.cameras[lonely].tobytes() == problem.cameras[lonely].tobytes()
     assert solution.problem.points[unseen].tobytes() == problem.points[unseen].tobytes()
-    assert (solution.problem.points[problem.point_index] != problem.points[problem.point_index]).any(axis=1).all()
+    assert (
+        (solution.problem.points[problem.point_index] != problem.points[problem.point_index])
+        .any(axis=1)
+        .all()
+    )
 
 
 # Programs
@@ -390,10 +450,13 @@ def compilations(run) -> int:
     ids=["pairs", "dense product"],
 )
 def test_another_problem_of_the_same_cell_compiles_nothing(run, dense):
-    """Other numbers of cameras, points and observations, other tracks; some cameras or points unobserved."""
+    """Other numbers of cameras, points and observations, other tracks; some cameras or points
+    unobserved."""
     one, other = mates(dense)
     run(one, "ceres", pad=True, max_iterations=3)
-    again = lambda **how: compilations(lambda: run(other, Ceres(initial=0.7), max_iterations=3, **how))
+    again = lambda **how: compilations(
+        lambda: run(other, Ceres(initial=0.7), max_iterations=3, **how)
+    )
     assert again(pad=True) == 0
     assert again(pad=False) > 0
 
@@ -406,7 +469,11 @@ def test_a_program_is_the_same_text_for_every_problem_of_a_cell():
         capacity = capacity_of(problem)
         layout = build_layout(problem, StepOptions(), capacity)
         state = state_of(layout, *padded_parameters(problem, capacity), StepOptions())
-        texts.add(solve_loop.__wrapped__.lower(layout, state, Ceres(), Tolerances(), StepOptions(), 10).as_text())
+        texts.add(
+            solve_loop.__wrapped__.lower(
+                layout, state, Ceres(), Tolerances(), StepOptions(), 10
+            ).as_text()
+        )
     assert len(texts) == 1
 
 
@@ -426,7 +493,9 @@ def test_where_there_is_a_choice_padding_takes_the_explicit_solver():
     solution = stepwise(support.tiny(), max_iterations=2, pad=True, linear_solver="auto")
     assert (solution.linear_solver, solution.capacity) == ("explicit", capacity_of(support.tiny()))
     options = StepOptions(linear_solver="implicit")
-    assert stepwise(support.tiny(), "ceres", options, max_iterations=2, pad=True, linear_solver="auto").capacity
+    assert stepwise(
+        support.tiny(), "ceres", options, max_iterations=2, pad=True, linear_solver="auto"
+    ).capacity
 
 
 def test_large_problems_have_no_capacity():
@@ -461,7 +530,8 @@ def test_a_large_problem_is_solved_as_it_is():
 
 
 def with_lenses(problem, lenses: int, seed: int):
-    """The problem with so many lenses for all of its cameras, some numbers of them held, and some poses and points."""
+    """The problem with so many lenses for all of its cameras, some numbers of them held, and some
+    poses and points."""
     random = np.random.default_rng(seed)
     lens_of_camera = np.arange(problem.num_cameras) % lenses
     cameras = np.array(problem.cameras)
@@ -479,7 +549,8 @@ def test_a_padded_solve_with_shared_lenses_and_constants_equals_the_one_of_the_g
 
 
 def test_what_is_shared_and_constant_changes_no_shape():
-    """Other images of a lens, other lenses of less than a quarter of them, other constants and other sizes."""
+    """Other images of a lens, other lenses of less than a quarter of them, other constants and
+    other sizes."""
     one, other = mates(dense=False)
     made = []
     for seed, (problem, lenses) in enumerate([(one, 2), (other, 2), (one, 3), (other, 4)]):

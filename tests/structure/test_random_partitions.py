@@ -27,7 +27,9 @@ def observed(cameras: int, points: int, seed: int, share: float = 0.3) -> Bundle
     sees = rng.random((cameras, points)) < share
     sees[0, 0] = True
     camera, point = np.nonzero(sees)
-    return BundleProblem.create(np.ones((cameras, 9)), np.ones((points, 3)), np.zeros((len(camera), 2)), camera, point)
+    return BundleProblem.create(
+        np.ones((cameras, 9)), np.ones((points, 3)), np.zeros((len(camera), 2)), camera, point
+    )
 
 
 def graph_of(problem: BundleProblem) -> csr_matrix:
@@ -73,7 +75,9 @@ def test_cameras_in_a_cluster_hang_together_by_shared_points(size, largest):
 
 def test_clusterings_differ_from_turn_to_turn_and_repeat_with_their_seed():
     graph = graph_of(observed(40, 200, 0))
-    draw = lambda seed: np.stack(list(itertools.islice(clusterings(graph, 10, np.random.default_rng(seed)), 5)))
+    draw = lambda seed: np.stack(
+        list(itertools.islice(clusterings(graph, 10, np.random.default_rng(seed)), 5))
+    )
     same = lambda a, b: np.array_equal(a[:, None] == a, b[:, None] == b)
     assert np.array_equal(draw(3), draw(3))
     assert not any(same(a, b) for a, b in itertools.combinations(draw(3), 2))
@@ -92,7 +96,8 @@ def test_the_heaviest_edge_that_was_cut_is_kept_in_the_next_turn():
 
 
 def test_better_communities_are_more_likely():
-    """Two cliques with one weak bridge: without randomness exactly the cliques, with it nearly always."""
+    """Two cliques with one weak bridge: without randomness exactly the cliques, with it nearly
+    always."""
     block = np.ones((6, 6)) - np.eye(6)
     weights = np.block([[block, np.zeros((6, 6))], [np.zeros((6, 6)), block]])
     weights[0, 6] = weights[6, 0] = 0.01
@@ -125,7 +130,9 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
         assert len({int(part.slot_replica[slots[0]]) for slots in pieces.values()}) == len(pieces)
         for slots in pieces.values():
             assert len(set(part.slot_replica[slots].tolist())) == 1
-            np.testing.assert_allclose(sums[part.slot_replica[slots[0]]], values[slots].sum(), atol=1e-12)
+            np.testing.assert_allclose(
+                sums[part.slot_replica[slots[0]]], values[slots].sum(), atol=1e-12
+            )
         listed = part.members[part.members < problem.num_cameras]
         assert sorted(listed.tolist()) == list(range(problem.num_cameras))
         for name, members in enumerate(part.members):
@@ -135,7 +142,9 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
 def test_small_problems_have_one_partition_with_one_cluster():
     partitions = build_layout(support.tiny(), StepOptions(method=StochasticClusters())).partitions
     assert partitions.label.shape == (1, 6)
-    many = build_layout(support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))).partitions
+    many = build_layout(
+        support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))
+    ).partitions
     assert many.label.shape == (PARTITIONS, 6)
 
 
@@ -147,6 +156,8 @@ def test_a_layout_without_partitions_says_how_to_get_them():
 @needs_data
 def test_no_cluster_of_a_real_problem_is_larger_than_asked():
     problem = read_bal(bal_file("problem-49-7776-pre"))
-    partitions = build_layout(problem, StepOptions(method=StochasticClusters(cluster_cameras=16))).partitions
+    partitions = build_layout(
+        problem, StepOptions(method=StochasticClusters(cluster_cameras=16))
+    ).partitions
     assert partitions.members.shape[2] <= 16
     assert 3 <= partitions.members.shape[1] <= 12

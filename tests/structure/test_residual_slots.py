@@ -1,4 +1,5 @@
-"""Observations that stand for rows of residuals are summed with those of pixels, in every kind of layout."""
+"""Observations that stand for rows of residuals are summed with those of pixels, in every kind of
+layout."""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ def test_every_ready_made_residual_has_an_example():
     assert set(MAKERS) == {*READY_MADE, OWN}
 
 
-@pytest.mark.parametrize("kind", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("buckets", "parts")), "padded"])
+@pytest.mark.parametrize(
+    "kind", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("buckets", "parts")), "padded"]
+)
 def test_sums_over_points_and_cameras_have_the_observations_of_rows(kind):
     for name in (*READY_MADE, OWN):
         problem = placed(row_examples.with_rows_of(row_examples.scene(0), [name], 0)).here
@@ -48,8 +51,12 @@ def test_sums_over_points_and_cameras_have_the_observations_of_rows(kind):
             real = layout.points < len(points)
             by_point[points[layout.points[real]]] += sums[:-1][real]
             by_camera += np.asarray(tree_sum(in_slots, layout.camera_levels))[: problem.num_cameras]
-        np.testing.assert_array_equal(by_point, np.bincount(problem.point_index, values), err_msg=name)
-        np.testing.assert_array_equal(by_camera, np.bincount(problem.camera_index, values), err_msg=name)
+        np.testing.assert_array_equal(
+            by_point, np.bincount(problem.point_index, values), err_msg=name
+        )
+        np.testing.assert_array_equal(
+            by_camera, np.bincount(problem.camera_index, values), err_msg=name
+        )
 
 
 @pytest.mark.parametrize("kind", ["buckets", "padded"])
@@ -58,7 +65,9 @@ def test_the_slots_of_a_row_hold_its_observations(kind):
         problem = placed(row_examples.with_rows_of(row_examples.scene(0), [name], 0)).here
         ((layout, *_),) = layouts(problem, kind)
         (given,), (rows,) = problem.residuals.rows, layout.residuals
-        np.testing.assert_array_equal(np.moveaxis(layout.observation[rows.slots], 2, 0), given.observation)
+        np.testing.assert_array_equal(
+            np.moveaxis(layout.observation[rows.slots], 2, 0), given.observation
+        )
         pixels, used = np.asarray(layout.slot_mask), np.asarray(layout.slot_used)
         assert not pixels[rows.slots].any(), name
         assert used[rows.slots].all(), name

@@ -1,4 +1,5 @@
-"""Numbers that are one unknown: all that is done with them is that of the matrix which copies unknowns to items."""
+"""Numbers that are one unknown: all that is done with them is that of the matrix which copies
+unknowns to items."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ def copy_matrix(sharing: Sharing) -> np.ndarray:
 
 
 def flat() -> tuple[Sharing, np.ndarray]:
-    """Two numbers of items that differ, then three of the items of `NAMES`, and names of all of them."""
+    """Two numbers of items that differ, then three of the items of `NAMES`, and names of all of
+    them."""
     apart, named = Sharing.of(np.arange(len(NAMES))), Sharing.of(NAMES)
     rows = [
         [*(f"of item {item}: {k}" for k in range(2)), *(f"of name {name}: {k}" for k in range(3))]
@@ -43,7 +45,10 @@ def test_items_of_equal_names_are_one_unknown():
 def test_products_are_those_of_the_matrix_of_copies(sharing):
     copies = copy_matrix(sharing)
     items, unknowns = copies.shape
-    rows, values = jnp.asarray(RNG.normal(size=(items, 3))), jnp.asarray(RNG.normal(size=(unknowns, 3)))
+    rows, values = (
+        jnp.asarray(RNG.normal(size=(items, 3))),
+        jnp.asarray(RNG.normal(size=(unknowns, 3))),
+    )
     matrix = RNG.normal(size=(items, items))
     matrix = matrix + matrix.T
     near = lambda found, wanted: np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
@@ -51,13 +56,18 @@ def test_products_are_those_of_the_matrix_of_copies(sharing):
     near(sharing.copied(values), copies @ values)
     near(sharing.sums(rows), copies @ copies.T @ rows)
     near(sharing.mean(rows), copies @ np.linalg.pinv(copies) @ rows)
-    near(sharing.copied(sharing.total(sharing.shares(sharing.copied(values)))), sharing.copied(values))
+    near(
+        sharing.copied(sharing.total(sharing.shares(sharing.copied(values)))),
+        sharing.copied(values),
+    )
     near(np.tril(sharing.merged(jnp.asarray(np.tril(matrix)))), np.tril(copies.T @ matrix @ copies))
 
 
 def test_what_differs_or_is_free_everywhere_is_left_alone():
     apart, rows = Sharing.of(np.arange(7)), jnp.ones((7, 7))
-    assert all(function(rows) is rows for function in (apart.sums, apart.mean, apart.shares, apart.merged))
+    assert all(
+        function(rows) is rows for function in (apart.sums, apart.mean, apart.shares, apart.merged)
+    )
     assert Mask.of(np.ones(7, bool)).where(rows, 0) is rows
     some = Mask.of(NAMES == 7)
     np.testing.assert_array_equal(some.where(rows, 0), np.where(NAMES == 7, np.ones((7, 7)), 0))

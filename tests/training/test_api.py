@@ -64,7 +64,10 @@ def test_a_reward_of_ones_own_is_the_reward(env):
         (lambda step, best, success: 1.0 if success else 0.0, "can trace: .*bool"),
         (lambda step, best: 1.0, "can trace: .*positional arguments"),
         (lambda step, best, success: None, "can trace: "),
-        (lambda step, best, success: jnp.stack([step.cost, best]), r"one number, not an array of shape \(2,\)"),
+        (
+            lambda step, best, success: jnp.stack([step.cost, best]),
+            r"one number, not an array of shape \(2,\)",
+        ),
         ("gain", "must be one of constant"),
     ],
 )
@@ -89,25 +92,36 @@ def test_actions_of_another_shape_are_refused(env):
         state, _ = env.reset(jax.random.key(0))
         for shape in ((4,), (3, 1), (4, 2), ()):
             with pytest.raises(ValueError, match=r"actions must have shape \(4, 1\), not"):
-                jax.eval_shape(lambda state, action: env.step(state, action), state, jnp.zeros(shape))
+                jax.eval_shape(
+                    lambda state, action: env.step(state, action), state, jnp.zeros(shape)
+                )
 
 
 def test_no_scene_worth_solving_is_said(monkeypatch):
     monkeypatch.setattr(scene_bank, "worth_solving", lambda kind, info: np.zeros(0, int))
-    with pytest.raises(InputError, match="none of 80 scenes of 5 cameras x 12 points is worth solving: draw more"):
+    with pytest.raises(
+        InputError, match="none of 80 scenes of 5 cameras x 12 points is worth solving: draw more"
+    ):
         jaxba.make_env("paper", *SMALL)
 
 
 @pytest.mark.slow
 def test_a_reward_that_is_no_number_ends_the_training_in_a_new_folder(env, tmp_path):
-    broken = replace(env, config=replace(env.config, reward=lambda step, best, success: jnp.nan * step.cost))
-    with pytest.raises(TrainError, match="chunk 1: all transitions hold numbers that are not finite; look at the rew"):
+    broken = replace(
+        env, config=replace(env.config, reward=lambda step, best, success: jnp.nan * step.cost)
+    )
+    with pytest.raises(
+        TrainError,
+        match="chunk 1: all transitions hold numbers that are not finite; look at the rew",
+    ):
         jaxba.train(broken, steps=8, folder=tmp_path / "new" / "run")
     assert (tmp_path / "new" / "run").is_dir()
 
 
 def test_windows_of_problems_in_memory_are_those_of_their_files(tmp_path):
-    problems = [jaxba.random_scene(jaxba.SceneConfig(cameras=24, points=200), seed) for seed in range(2)]
+    problems = [
+        jaxba.random_scene(jaxba.SceneConfig(cameras=24, points=200), seed) for seed in range(2)
+    ]
     files = [tmp_path / f"{number}.txt" for number in range(2)]
     for problem, file in zip(problems, files, strict=True):
         jaxba.write_problem(problem, file)

@@ -49,7 +49,9 @@ def test_the_default_is_for_lambda_alone_on_plain_steps():
 
 
 def test_a_file_may_extend_a_preset_and_overrides_win_over_both(tmp_path):
-    path = written(tmp_path, "extends: default\nseed: 3\ngame: {agent: {refinement: {trials: 2}}}\n")
+    path = written(
+        tmp_path, "extends: default\nseed: 3\ngame: {agent: {refinement: {trials: 2}}}\n"
+    )
     found = load(path, ["seed=4"])
     assert found == load("default", ["seed=4", "game.agent.refinement.trials=2"])
 
@@ -97,7 +99,9 @@ def test_an_empty_file_is_the_defaults_of_the_classes(tmp_path):
 
 
 def test_overrides_win_over_the_file_and_reach_every_level():
-    found = load("default", ["seed=7", "sac.width=128", "game.agent.history=3", "sac.learning_rate=3e-4"])
+    found = load(
+        "default", ["seed=7", "sac.width=128", "game.agent.history=3", "sac.learning_rate=3e-4"]
+    )
     assert (found.seed, found.sac.width, found.game.agent.history) == (7, 128, 3)
     assert found.sac.learning_rate == 3e-4
     assert found.sac == dataclasses.replace(load("default").sac, width=128, learning_rate=3e-4)
@@ -115,13 +119,19 @@ def test_overrides_are_yaml():
         ],
     )
     assert found.bank.kind == SceneClass(8, 30)
-    assert (found.bank.scenes, found.sac.target_entropy, found.sac.learn_temperature) == (10, None, False)
+    assert (found.bank.scenes, found.sac.target_entropy, found.sac.learn_temperature) == (
+        10,
+        None,
+        False,
+    )
     assert isinstance(found.sac.gamma, float)
 
 
 def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
     assert load("default", ["game.agent.guard=off"]).game.agent.guard == "off"
-    assert load(written(tmp_path, "game: {agent: {guard: off}}")).game.agent == AgentConfig(guard="off")
+    assert load(written(tmp_path, "game: {agent: {guard: off}}")).game.agent == AgentConfig(
+        guard="off"
+    )
 
 
 # What is refused
@@ -146,7 +156,10 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("envs=[64]", "envs must be a whole number, is [64]"),
         ("bank.problems=a", "bank.problems must be a list, is 'a'"),
         ("bank.problems=[1]", "bank.problems[0] must be text, is 1"),
-        ("game.reward=fun", "game.reward must be one of constant, clock, reduction, reversed, is 'fun'"),
+        (
+            "game.reward=fun",
+            "game.reward must be one of constant, clock, reduction, reversed, is 'fun'",
+        ),
         ("sac.width=[", "not YAML"),
         ("sac.width", "must be key=value"),
         ("chunks=0", "chunks must be at least 1, is 0"),
@@ -156,7 +169,11 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("loop.replay_capacity=0", "loop: replay_capacity must be at least 1"),
         ("game.agent.history=30", "game.agent: history must be 1 to 20"),
         ("loop.replay_capacity=3000000000", "loop: replay_capacity must be at most 2147483647"),
-        ("sac.width=512", "sac.width 512 with sac.layers 2 makes a policy of 1181704 bytes, more than the 1032192"),
+        (
+            "sac.width=512",
+            "sac.width 512 with sac.layers 2 makes a policy of 1181704 bytes, more than the "
+            "1032192",
+        ),
         ("game.agent.first_low=5", "game.agent: first_low must be at most high, 2.0, is 5"),
         ("sac.width=0", "sac.width must be at least 1"),
         ("sac.gamma=1.5", "sac.gamma must lie in (0, 1]"),
@@ -188,7 +205,10 @@ def test_a_bad_file_is_named(text, message, tmp_path):
 
 def test_files_that_are_not_there_or_no_text(tmp_path):
     known = ", ".join(configurations.names("train"))
-    assert refused(name="fastest") == f"no configuration 'fastest'; known: {known}, or the path of a file"
+    assert (
+        refused(name="fastest")
+        == f"no configuration 'fastest'; known: {known}, or the path of a file"
+    )
     assert "No such file" in refused(name=str(tmp_path / "none.yaml"))
     assert "directory" in refused(name=f"{tmp_path}/").lower()
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")

@@ -1,4 +1,5 @@
-"""What a full disk or a power failure leaves of a run: a torn log, checkpoints that were cut short."""
+"""What a full disk or a power failure leaves of a run: a torn log, checkpoints that were cut
+short."""
 
 from __future__ import annotations
 
@@ -87,7 +88,9 @@ def test_a_stray_checkpoint_of_a_higher_number_displaces_none(folder, unbroken):
 def test_damaged_checkpoints_alone_are_one_line(folder):
     for number in (4, 6):
         cut(folder / driver.CHECKPOINTS / f"step_{number}.npz")
-    with pytest.raises(TrainError, match=r"^the last checkpoint does not fit: [^\n]*step_6[^\n]* \(and 1 more\)"):
+    with pytest.raises(
+        TrainError, match=r"^the last checkpoint does not fit: [^\n]*step_6[^\n]* \(and 1 more\)"
+    ):
         resumed(folder)
 
 
@@ -107,7 +110,11 @@ def test_damaged_lines_of_the_log_are_dropped_with_a_word(tear, folder, unbroken
     path = folder / log.FILE
     whole = path.read_bytes()
     path.write_bytes(TEARS[tear](whole))
-    good = [line for line in path.read_bytes().splitlines(keepends=True) if line in whole.splitlines(keepends=True)]
+    good = [
+        line
+        for line in path.read_bytes().splitlines(keepends=True)
+        if line in whole.splitlines(keepends=True)
+    ]
     expected = [json.loads(line) for line in good]
     assert log.read(folder) == expected
     outcome, said = resumed(folder)

@@ -1,4 +1,5 @@
-"""The training driver on a toy game: the same numbers after a kill, a log without gaps, no two runs mixed up."""
+"""The training driver on a toy game: the same numbers after a kill, a log without gaps, no two runs
+mixed up."""
 
 from __future__ import annotations
 
@@ -72,7 +73,10 @@ def same(one: Outcome, other: Outcome) -> None:
     """Bit for bit."""
     assert one.best
     assert [best[1:] for best in one.best] == [best[1:] for best in other.best]
-    for a, b in ((one.state, other.state), ([x.actor for x in one.best], [x.actor for x in other.best])):
+    for a, b in (
+        (one.state, other.state),
+        ([x.actor for x in one.best], [x.actor for x in other.best]),
+    ):
         first, second = checkpoint.pack(a), checkpoint.pack(b)
         assert list(first) == list(second)
         for name in first:
@@ -94,7 +98,15 @@ def test_every_chunk_has_its_row(whole):
     assert [(row["seed"], row["chunk"]) for row in found] == [(0, k) for k in range(1, 7)]
     assert [row["env_steps"] for row in found] == [16 + 40 * k for k in range(1, 7)]
     assert [row["updates"] for row in found] == [5 * k for k in range(1, 7)]
-    names = {*CLOCKS[:-1], "entropy", "temperature", "q_mean", "critic_loss", "actor_loss", "action_mean"}
+    names = {
+        *CLOCKS[:-1],
+        "entropy",
+        "temperature",
+        "q_mean",
+        "critic_loss",
+        "actor_loss",
+        "action_mean",
+    }
     names |= {"action_std", "episode/length", "reward", "dropped"}
     for row in found:
         assert names <= set(row)
@@ -109,7 +121,9 @@ def test_numbers_that_are_not_finite_are_null(whole):
 
 
 def test_the_best_policy_is_that_of_the_lowest_score_on_training_scenes(whole):
-    scores = {row["chunk"]: row["training/score"] for row in log.read(whole[0]) if "training/score" in row}
+    scores = {
+        row["chunk"]: row["training/score"] for row in log.read(whole[0]) if "training/score" in row
+    }
     (best,) = whole[1].best
     assert best.chunk == min(scores, key=scores.__getitem__)
     assert best.score == scores[best.chunk]
@@ -189,21 +203,31 @@ def test_a_run_made_shorter_ends_with_an_evaluation_of_what_it_has(chunks, tmp_p
 
 
 @pytest.mark.slow
-def test_several_agents_learn_side_by_side_what_each_learns_alone_also_after_a_kill(whole, tmp_path):
+def test_several_agents_learn_side_by_side_what_each_learns_alone_also_after_a_kill(
+    whole, tmp_path
+):
     config = dataclasses.replace(CONFIG, seeds=2)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     outcome = run(straight, config)
     found = rows(straight)
-    assert [(row["seed"], row["chunk"]) for row in found] == [(s, k) for k in range(1, 7) for s in (0, 1)]
+    assert [(row["seed"], row["chunk"]) for row in found] == [
+        (s, k) for k in range(1, 7) for s in (0, 1)
+    ]
     for row, alone in zip(found[::2], rows(whole[0]), strict=True):
         assert {name: x for name, x in row.items() if x is not None} == pytest.approx(
             {name: x for name, x in alone.items() if x is not None}, rel=1e-3, abs=1e-6
         )
     assert found[1]["critic_loss"] != found[0]["critic_loss"]
     for agent, best in enumerate(outcome.best):
-        scores = {row["chunk"]: row["training/score"] for row in found[agent::2] if "training/score" in row}
+        scores = {
+            row["chunk"]: row["training/score"]
+            for row in found[agent::2]
+            if "training/score" in row
+        }
         assert (best.agent, best.chunk) == (agent, min(scores, key=scores.__getitem__))
-    assert driver.best_of(outcome.best).score == min(row.get("training/score", np.inf) for row in found)
+    assert driver.best_of(outcome.best).score == min(
+        row.get("training/score", np.inf) for row in found
+    )
     with pytest.raises(Killed):
         run(broken, config, rows=kill_after(3))
     same(run(broken, resume=True), outcome)
@@ -278,7 +302,11 @@ def test_losses_that_are_no_numbers_end_the_run_before_they_are_saved(tmp_path):
 
 
 def tree():
-    return {"key": jax.random.key(3), "pair": (jnp.arange(3.0), None), "flag": jnp.array([True, False])}
+    return {
+        "key": jax.random.key(3),
+        "pair": (jnp.arange(3.0), None),
+        "flag": jnp.array([True, False]),
+    }
 
 
 @pytest.mark.parametrize("name", ["checkpoints", "[x]", "a*", "what?"])
@@ -308,7 +336,9 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_is_one_line(tmp_path, monk
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(TrainError, match=r"^[^\n]*step_6\.npz cannot be written: No space left on device$"):
+    with pytest.raises(
+        TrainError, match=r"^[^\n]*step_6\.npz cannot be written: No space left on device$"
+    ):
         checkpoint.save(tmp_path, 6, checkpoint.pack(tree()), {}, 1)
     assert [item.name for item in tmp_path.iterdir()] == ["step_5.npz"]
 
@@ -318,7 +348,10 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_is_one_line(tmp_path, monk
     [
         (lambda arrays: arrays.pop("flag"), "flag is missing"),
         (lambda arrays: arrays.update(flag=np.zeros(2)), r"flag is float64\[2\], not bool\[2\]"),
-        (lambda arrays: arrays.update({"pair.0": np.zeros(4)}), r"pair\.0 is float64\[4\], not float64\[3\]"),
+        (
+            lambda arrays: arrays.update({"pair.0": np.zeros(4)}),
+            r"pair\.0 is float64\[4\], not float64\[3\]",
+        ),
     ],
 )
 def test_a_checkpoint_of_something_else_is_refused(change, message):
@@ -342,7 +375,10 @@ def test_scenes_survive_their_file(tmp_path):
     def bank(count: int) -> Bank:
         number = jnp.arange(count, dtype=jnp.float64)
         scenes = Scenes(
-            jnp.ones((count, 9, 4)), jnp.ones((count, 3, 11)), jnp.ones((count, 2, 44)), jnp.ones((count, 44), bool)
+            jnp.ones((count, 9, 4)),
+            jnp.ones((count, 3, 11)),
+            jnp.ones((count, 2, 44)),
+            jnp.ones((count, 44), bool),
         )
         whole = number.astype(jnp.int32)
         info = ProblemInfo(number, whole, whole, whole, number, number, whole)
@@ -356,12 +392,18 @@ def test_scenes_survive_their_file(tmp_path):
     with np.load(tmp_path / "bank.npz") as file:
         older = {name: file[name] for name in file.files if not name.endswith("best_cost")}
     np.savez(tmp_path / "older.npz", **older)
-    message = r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in a new folder$"
+    message = (
+        r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in "
+        r"a "
+        r"new folder$"
+    )
     with pytest.raises(TrainError, match=message):
         task.read_split(tmp_path / "older.npz")
     for damage in (b"", b"no bank", (tmp_path / "bank.npz").read_bytes()[:-100]):
         (tmp_path / "damaged.npz").write_bytes(damage)
-        with pytest.raises(TrainError, match=r"^[^\n]*damaged.npz: damaged; begin in a new folder$"):
+        with pytest.raises(
+            TrainError, match=r"^[^\n]*damaged.npz: damaged; begin in a new folder$"
+        ):
             task.read_split(tmp_path / "damaged.npz")
 
 

@@ -17,7 +17,13 @@ def transitions(first: int, count: int) -> Transition:
     """Transitions that carry their number in every place, each place with another fraction."""
     number = np.arange(first, first + count, dtype=np.float64)
     wide = lambda width, shift: number[:, None] + shift + np.arange(width) / 64
-    columns = wide(FEATURES, 0.0), wide(ACTIONS, 0.25), number + 0.5, wide(FEATURES, 0.75), number % 2
+    columns = (
+        wide(FEATURES, 0.0),
+        wide(ACTIONS, 0.25),
+        number + 0.5,
+        wide(FEATURES, 0.75),
+        number % 2,
+    )
     return Transition(*map(jnp.asarray, columns))
 
 
@@ -83,4 +89,12 @@ def test_compiled_and_batched() -> None:
     batches = jax.tree.map(lambda *x: jnp.stack(x), transitions(20, 2), transitions(30, 2))
     added = jax.vmap(replay.add)(both, batches)
     for i, first in enumerate((20, 30)):
-        assert numbers(jax.tree.map(lambda x, i=i: x[i], added)) == [7, 8, first, first + 1, 4, 5, 6]
+        assert numbers(jax.tree.map(lambda x, i=i: x[i], added)) == [
+            7,
+            8,
+            first,
+            first + 1,
+            4,
+            5,
+            6,
+        ]

@@ -1,4 +1,5 @@
-"""The agent: its distribution over actions, its networks, and single updates that can be worked out by hand."""
+"""The agent: its distribution over actions, its networks, and single updates that can be worked out
+by hand."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ FEATURES, ACTIONS = 3, 2
 SMALL = SacConfig(width=8, layers=1, batch=32, gamma=0.5, learning_rate=1e-5)
 """So small a rate that what is updated first does not disturb what is computed next."""
 
-VALUE = dataclasses.replace(SMALL, variant="value", learn_temperature=False, tau=1.0, target_every=3, layer_norm=False)
+VALUE = dataclasses.replace(
+    SMALL, variant="value", learn_temperature=False, tau=1.0, target_every=3, layer_norm=False
+)
 
 _update = jax.jit(sac.update, static_argnames=("config",))
 _init = jax.jit(sac.init, static_argnames=("config", "observation_size", "action_size"))
@@ -37,7 +40,11 @@ def batch(count: int = 32, reward: float = 2.0, discount: float = 1.0) -> Transi
     wide = lambda key, size: jax.random.uniform(key, (count, size), jnp.float64, -1, 1)
     full = lambda x: jnp.full(count, x, jnp.float64)
     return Transition(
-        wide(keys[0], FEATURES), wide(keys[1], ACTIONS), full(reward), wide(keys[2], FEATURES), full(discount)
+        wide(keys[0], FEATURES),
+        wide(keys[1], ACTIONS),
+        full(reward),
+        wide(keys[2], FEATURES),
+        full(discount),
     )
 
 
@@ -47,7 +54,9 @@ def zeroed(params, biases):
     paths, tree = jax.tree_util.tree_flatten_with_path(zeros)
     last = f"['Dense_{SMALL.layers}']['bias']"
     filled = [
-        jnp.asarray(biases, x.dtype).reshape(x.shape) if jax.tree_util.keystr(path).endswith(last) else x
+        jnp.asarray(biases, x.dtype).reshape(x.shape)
+        if jax.tree_util.keystr(path).endswith(last)
+        else x
         for path, x in paths
     ]
     assert sum(jax.tree_util.keystr(path).endswith(last) for path, _ in paths) == 1
@@ -66,12 +75,16 @@ def test_density_is_that_of_the_squashed_variable(mean: float, log_std: float) -
     x = np.linspace(mean - 10 * np.exp(log_std), mean + 10 * np.exp(log_std), 40_001)
     x = x[np.abs(x) < 9]  # beyond, float64 cannot tell u from one
     log_density = networks.log_probability(
-        jnp.asarray((x - mean) / np.exp(log_std))[:, None], jnp.full((x.size, 1), log_std), jnp.asarray(x)[:, None]
+        jnp.asarray((x - mean) / np.exp(log_std))[:, None],
+        jnp.full((x.size, 1), log_std),
+        jnp.asarray(x)[:, None],
     )
     u = np.tanh(x)
     expected = stats.norm.logpdf(np.arctanh(u), mean, np.exp(log_std)) - np.log((1 - u) * (1 + u))
     np.testing.assert_allclose(log_density, expected, rtol=1e-6, atol=1e-6)
-    inside = stats.norm.cdf(x[-1], mean, np.exp(log_std)) - stats.norm.cdf(x[0], mean, np.exp(log_std))
+    inside = stats.norm.cdf(x[-1], mean, np.exp(log_std)) - stats.norm.cdf(
+        x[0], mean, np.exp(log_std)
+    )
     np.testing.assert_allclose(integrate.trapezoid(np.exp(log_density), u), inside, rtol=1e-4)
 
 
@@ -106,7 +119,9 @@ def test_far_tails_stay_finite_and_inside() -> None:
 
 def test_everything_is_float32_and_the_members_differ() -> None:
     learner = fresh(SMALL)
-    for leaf in jax.tree.leaves((learner.actor, learner.critic, learner.target, learner.log_temperature)):
+    for leaf in jax.tree.leaves(
+        (learner.actor, learner.critic, learner.target, learner.log_temperature)
+    ):
         assert leaf.dtype == jnp.float32
     stepped, metrics = _update(SMALL, learner, batch())
     chex.assert_trees_all_equal_shapes_and_dtypes(learner, stepped)
@@ -118,11 +133,15 @@ def test_everything_is_float32_and_the_members_differ() -> None:
 @pytest.mark.parametrize("config", [SMALL, VALUE], ids=["twin", "value"])
 def test_a_fresh_agent_knows_nothing(config: SacConfig) -> None:
     learner, data = fresh(config), batch()
-    opinions = sac._critic(config).apply(learner.critic, *(jnp.asarray(x, jnp.float32) for x in data[:2]))
+    opinions = sac._critic(config).apply(
+        learner.critic, *(jnp.asarray(x, jnp.float32) for x in data[:2])
+    )
     assert opinions.shape == (2, 32)
     np.testing.assert_allclose(opinions, 0, atol=0.1)
     np.testing.assert_allclose(sac.act(config, learner.actor, data.observation, None), 0, atol=0.1)
-    mean, log_std = sac._actor(config, ACTIONS).apply(learner.actor, jnp.asarray(data.observation, jnp.float32))
+    mean, log_std = sac._actor(config, ACTIONS).apply(
+        learner.actor, jnp.asarray(data.observation, jnp.float32)
+    )
     np.testing.assert_allclose(log_std, 0, atol=0.2)
     assert mean.shape == log_std.shape == (32, ACTIONS)
 
@@ -183,20 +202,26 @@ def test_targets_with_a_value_network(discount: float) -> None:
 
 def test_the_entropy_bonus_has_the_temperature_as_its_weight() -> None:
     learner = fresh(SMALL)
-    learner = learner._replace(critic=zeroed(learner.critic, [1.0, 1.0]), target=zeroed(learner.target, [0.0, 0.0]))
+    learner = learner._replace(
+        critic=zeroed(learner.critic, [1.0, 1.0]), target=zeroed(learner.target, [0.0, 0.0])
+    )
     _, metrics = _update(SMALL, learner, batch(reward=0.0))
     np.testing.assert_allclose(metrics["actor_loss"], -1 - 0.1 * metrics["entropy"], rtol=1e-4)
     # the fresh policy is the same everywhere: tanh of a standard normal number, twice
     density = lambda x: stats.norm.pdf(x) * (2 * np.log(np.cosh(x)) + stats.norm.logpdf(x))
     entropy = -2 * integrate.quad(density, -8, 8)[0]
     np.testing.assert_allclose(metrics["entropy"], entropy, atol=0.3)
-    np.testing.assert_allclose(metrics["critic_loss"], 2 * (1 - 0.5 * 0.1 * entropy) ** 2, rtol=0.04)
+    np.testing.assert_allclose(
+        metrics["critic_loss"], 2 * (1 - 0.5 * 0.1 * entropy) ** 2, rtol=0.04
+    )
 
 
 def test_the_target_follows_softly_or_now_and_then() -> None:
     learner = fresh(SMALL)
     after, _ = _update(SMALL, learner, batch())
-    expected = jax.tree.map(lambda old, new: 0.995 * old + 0.005 * new, learner.target, after.critic)
+    expected = jax.tree.map(
+        lambda old, new: 0.995 * old + 0.005 * new, learner.target, after.critic
+    )
     chex.assert_trees_all_close(after.target, expected, rtol=1e-5, atol=1e-7)
 
     learner = fresh(VALUE)
@@ -204,7 +229,9 @@ def test_the_target_follows_softly_or_now_and_then() -> None:
     for count in range(1, 7):
         before, (learner, _) = learner, _update(VALUE, learner, batch())
         assert int(learner.updates) == count
-        chex.assert_trees_all_equal(learner.target, learner.value if count % 3 == 0 else before.target)
+        chex.assert_trees_all_equal(
+            learner.target, learner.value if count % 3 == 0 else before.target
+        )
         assert not equal(learner.value, before.value)
     assert not equal(learner.target, start)
 
@@ -228,5 +255,8 @@ def test_a_fixed_temperature_stays() -> None:
 def test_the_papers_networks_have_as_many_layers_as_it_says() -> None:
     paper = load("paper").sac
     layers = jax.eval_shape(lambda key: sac.init(paper, key, 5, 1), jax.random.key(0))
-    count = lambda params: sum("kernel" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(params))
-    assert (count(layers.actor), count(layers.critic), count(layers.value)) == (4, 3, 3)  # two critics, stacked
+    count = lambda params: sum(
+        "kernel" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(params)
+    )
+    # two critics, stacked
+    assert (count(layers.actor), count(layers.critic), count(layers.value)) == (4, 3, 3)

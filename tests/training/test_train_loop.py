@@ -1,4 +1,5 @@
-"""The compiled training loop on games whose answer is known, and its promises: one trace, the same numbers."""
+"""The compiled training loop on games whose answer is known, and its promises: one trace, the same
+numbers."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ TWIN = SacConfig(
     initial_temperature=1e-3,
     learn_temperature=False,
 )
-"""Quick to learn. The entropy bonus is at most 1e-3 log 2 / (1 - gamma) = 0.004 and lies within every tolerance."""
+"""Quick to learn. The entropy bonus is at most 1e-3 log 2 / (1 - gamma) = 0.004 and lies within
+every tolerance."""
 
 VALUE = dataclasses.replace(TWIN, variant="value", layer_norm=False, tau=1.0, target_every=5)
 AGENTS = {"twin": TWIN, "value": VALUE}
@@ -48,12 +50,20 @@ def trained(agent: str, toy: toys.Toy) -> tuple[LoopState, dict[str, float]]:
     return state, {name: float(value) for name, value in metrics.items()}
 
 
-def opinions(agent: str, toy: toys.Toy, sign: float, clock: float = 0.0, action: float | None = None) -> np.ndarray:
+def opinions(
+    agent: str, toy: toys.Toy, sign: float, clock: float = 0.0, action: float | None = None
+) -> np.ndarray:
     """What both critics say, at the policy's own action when None."""
     config, learner = AGENTS[agent], trained(agent, toy)[0].learner
     observation = jnp.asarray([[sign, clock]], jnp.float32)
-    chosen = sac.act(config, learner.actor, observation, None) if action is None else jnp.full((1, 1), action)
-    return np.asarray(sac._critic(config).apply(learner.critic, observation, jnp.asarray(chosen, jnp.float32)))[:, 0]
+    chosen = (
+        sac.act(config, learner.actor, observation, None)
+        if action is None
+        else jnp.full((1, 1), action)
+    )
+    return np.asarray(
+        sac._critic(config).apply(learner.critic, observation, jnp.asarray(chosen, jnp.float32))
+    )[:, 0]
 
 
 def copied(state: LoopState) -> LoopState:
@@ -62,7 +72,10 @@ def copied(state: LoopState) -> LoopState:
 
 def plain(tree):
     """The tree with keys as numbers."""
-    return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
+    return jax.tree.map(
+        lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x,
+        tree,
+    )
 
 
 # games with a known answer
@@ -87,10 +100,14 @@ def test_a_delayed_reward(agent: str, clock: float, expected: float) -> None:
 def test_a_reward_that_depends_on_the_action(agent: str) -> None:
     learner = trained(agent, toys.ACTION)[0].learner
     observation = jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])
-    np.testing.assert_allclose(sac.act(AGENTS[agent], learner.actor, observation, None), 0.3, atol=0.1)
+    np.testing.assert_allclose(
+        sac.act(AGENTS[agent], learner.actor, observation, None), 0.3, atol=0.1
+    )
     np.testing.assert_allclose(opinions(agent, toys.ACTION, 1.0), 0, atol=0.05)
     for action in (0.0, 0.3, 0.6):
-        np.testing.assert_allclose(opinions(agent, toys.ACTION, 1.0, action=action), -((action - 0.3) ** 2), atol=0.1)
+        np.testing.assert_allclose(
+            opinions(agent, toys.ACTION, 1.0, action=action), -((action - 0.3) ** 2), atol=0.1
+        )
 
 
 @both_agents
@@ -118,7 +135,11 @@ def test_critics_see_what_the_policy_does_not() -> None:
 def test_without_the_privilege_critics_see_what_the_policy_sees() -> None:
     plain_critics = dataclasses.replace(TWIN, privileged=False)
     state = start(plain_critics, SHORT, toys.HIDDEN, jax.random.key(0))
-    widths = {x.shape[-2] for path, x in jax.tree_util.tree_leaves_with_path(state.learner.critic) if _is_first(path)}
+    widths = {
+        x.shape[-2]
+        for path, x in jax.tree_util.tree_leaves_with_path(state.learner.critic)
+        if _is_first(path)
+    }
     assert widths == {1 + 1}  # the clock and the action
     _, metrics = run_chunk(plain_critics, SHORT, toys.HIDDEN, state)
     assert np.isfinite(metrics["critic_loss"])
@@ -130,7 +151,9 @@ def _is_first(path) -> bool:
 
 @both_agents
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_truncated_episode_has_the_value_of_its_true_last_observation(agent: str, sign: float) -> None:
+def test_a_truncated_episode_has_the_value_of_its_true_last_observation(
+    agent: str, sign: float
+) -> None:
     truth, mistaken = 1 / (1 - GAMMA), 1 / (1 - GAMMA / 2)
     assert truth > 2 * mistaken
     np.testing.assert_allclose(opinions(agent, toys.ENDLESS, sign), sign * truth, atol=1)
@@ -160,7 +183,9 @@ def test_the_entropy_reaches_what_is_wanted() -> None:
 def test_numbers_that_are_not_finite_are_kept_out() -> None:
     toy = dataclasses.replace(toys.SEEN, breaks=True)
     state, metrics = trained("twin", toy)
-    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(plain((state.learner, state.replay))))
+    assert all(
+        np.all(np.isfinite(x)) for x in jax.tree.leaves(plain((state.learner, state.replay)))
+    )
     assert metrics["dropped"] == LONG.steps_per_chunk * toy.num_envs / 2
     for sign in (-1.0, 1.0):
         np.testing.assert_allclose(opinions("twin", toy, sign), sign, atol=0.05)
@@ -175,7 +200,8 @@ def test_what_is_counted() -> None:
     assert metrics["episodes"] == LONG.steps_per_chunk * 8 / 2
     assert metrics["episode/length"] == 2
     assert metrics["dropped"] == 0
-    np.testing.assert_allclose(metrics["reward"], 0, atol=0.15)  # signs of 1000 episodes, five standard deviations
+    # signs of 1000 episodes, five standard deviations
+    np.testing.assert_allclose(metrics["reward"], 0, atol=0.15)
 
 
 def test_a_chunk_without_an_end_has_no_means_of_episodes() -> None:
@@ -205,10 +231,14 @@ def test_the_bias_is_value_less_return_with_entropy_in_terminated_episodes() -> 
                 paid = reward[k + rest, env] + np.where(rest > 0, bonus[k + rest, env], 0)
                 errors.append(value[k, env] - np.sum(GAMMA**rest * paid))
     assert 10 < len(errors) < 50
-    found = train_loop._bias(train_loop._Judged(*map(jnp.asarray, (value, bonus, reward, terminated, ended))), GAMMA)
+    found = train_loop._bias(
+        train_loop._Judged(*map(jnp.asarray, (value, bonus, reward, terminated, ended))), GAMMA
+    )
     np.testing.assert_allclose(found, np.mean(errors), rtol=1e-12)
     nothing = jnp.zeros((12, 5), bool)
-    assert jnp.isnan(train_loop._bias(train_loop._Judged(value, bonus, reward, nothing, nothing), GAMMA))
+    assert jnp.isnan(
+        train_loop._bias(train_loop._Judged(value, bonus, reward, nothing, nothing), GAMMA)
+    )
 
 
 def test_the_spread_of_actions_is_that_of_what_is_to_be_done() -> None:
@@ -227,8 +257,11 @@ def test_the_warm_up_holds_the_demonstrations() -> None:
 
 def test_compiles_once() -> None:
     once = functools.partial(jax.jit, static_argnames=("sac", "loop"))
-    begin, chunk = (once(chex.assert_max_traces(function.__wrapped__, n=1)) for function in (start, run_chunk))
-    for seed, slope in enumerate((1.0, 2.0, -1.0)):  # other numbers, other keys, several chunks: the same program
+    begin, chunk = (
+        once(chex.assert_max_traces(function.__wrapped__, n=1)) for function in (start, run_chunk)
+    )
+    # other numbers, other keys, several chunks: the same program
+    for seed, slope in enumerate((1.0, 2.0, -1.0)):
         game = dataclasses.replace(toys.SEEN, slope=slope)
         state = begin(LEARNS, SHORT, game, jax.random.key(seed))
         for _ in range(3):
@@ -282,17 +315,25 @@ def test_the_same_key_gives_the_same_numbers_and_a_run_goes_on_from_its_state() 
         again, _ = run_chunk(TWIN, LONG, toys.BOTH, again)
     stored = jax.tree.map(np.asarray, plain(again))
     restored = jax.tree.map(
-        lambda x, y: jax.random.wrap_key_data(x) if jnp.issubdtype(y.dtype, jax.dtypes.prng_key) else jnp.asarray(x),
+        lambda x, y: (
+            jax.random.wrap_key_data(x)
+            if jnp.issubdtype(y.dtype, jax.dtypes.prng_key)
+            else jnp.asarray(x)
+        ),
         stored,
         again,
     )
     again, _ = run_chunk(TWIN, LONG, toys.BOTH, restored)
     chex.assert_trees_all_equal(one, again)
     other = start(TWIN, LONG, toys.BOTH, jax.random.key(1))
-    assert not np.array_equal(other.replay.rows, start(TWIN, LONG, toys.BOTH, jax.random.key(0)).replay.rows)
+    assert not np.array_equal(
+        other.replay.rows, start(TWIN, LONG, toys.BOTH, jax.random.key(0)).replay.rows
+    )
 
 
-@pytest.mark.parametrize("name", ["replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"])
+@pytest.mark.parametrize(
+    "name", ["replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"]
+)
 def test_a_loop_needs_something_of_everything(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         LoopConfig(**{name: 0})

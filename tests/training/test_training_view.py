@@ -25,9 +25,26 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
     """The rows of a chunk of three agents."""
     found = []
     for k in range(3):
-        row = {"seed": k, "chunk": chunk, "updates": 8 * chunk, "wall_s": 1.5 * chunk, "episodes": 4.0}
-        row |= {"steps_per_s": 1234.0, "updates_per_s": 56.0, "episode/length": 5.0 + k, "episode/ceres": 7.5}
-        row |= {"critic_loss": 0.25, "q_bias": 0.5, "q_mean": -2.0, "entropy": -0.5, "action_spread": 0.1 * k}
+        row = {
+            "seed": k,
+            "chunk": chunk,
+            "updates": 8 * chunk,
+            "wall_s": 1.5 * chunk,
+            "episodes": 4.0,
+        }
+        row |= {
+            "steps_per_s": 1234.0,
+            "updates_per_s": 56.0,
+            "episode/length": 5.0 + k,
+            "episode/ceres": 7.5,
+        }
+        row |= {
+            "critic_loss": 0.25,
+            "q_bias": 0.5,
+            "q_mean": -2.0,
+            "entropy": -0.5,
+            "action_spread": 0.1 * k,
+        }
         if scores:
             row |= {"held_out/score": scores[k], "held_out/p90": 6.0, "held_out/failures": 0.01}
         found.append(row)
@@ -35,12 +52,21 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
 
 
 def test_a_chunk_has_a_line_and_its_held_out_scores_another():
-    first, health, second, warning = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True, decades=6.0, left_s=5.2)
-    assert first == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), about 5 s left"
+    first, health, second, warning = view.lines(
+        rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True, decades=6.0, left_s=5.2
+    )
+    assert (
+        first
+        == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), about 5 s left"
+    )
     assert second.startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
-    assert second.endswith(", failures 1.0 % (ceres 6.00, constant action 5.00), best on training scenes so far")
+    assert second.endswith(
+        ", failures 1.0 % (ceres 6.00, constant action 5.00), best on training scenes so far"
+    )
     spread = "spread of log10(lambda) over states"
-    assert health.endswith(f"critics' loss 0.25, bias +0.5 of -2, entropy -0.50 nats, {spread} 0.00, 0.60, 1.20")
+    assert health.endswith(
+        f"critics' loss 0.25, bias +0.5 of -2, entropy -0.50 nats, {spread} 0.00, 0.60, 1.20"
+    )
     assert warning == f"warning: 1 of 3 policies do the same in every state ({spread} 0.00)"
     assert len(view.lines(rows(2), 4, RULES)) == 2
 
@@ -51,7 +77,9 @@ def test_a_policy_that_learned_nothing_is_called_that_once_in_plain_words():
     assert said() == []
     assert said(q_bias=None) == []
     (same,) = said(action_spread=0.003)
-    assert same.endswith("this policy does the same in every state (spread of log10(lambda) over states 0.02)")
+    assert same.endswith(
+        "this policy does the same in every state (spread of log10(lambda) over states 0.02)"
+    )
     (both,) = said(action_spread=0.003, entropy=0.67)
     assert both.endswith("; this policy does anything at random (entropy 0.67 of 0.69 nats)")
     assert said(entropy=0.5) == []
@@ -83,9 +111,13 @@ def test_the_page_has_mean_range_yardsticks_and_the_policys_lambda():
     np.testing.assert_allclose(trained["y"], [6.0, 12.5 / 3], rtol=1e-6)
     ceres = next(trace for trace in mean if trace.get("name") == "ceres")
     assert ceres["y"] == [6.0, 6.0]
-    for trace, row, count in zip(charts["damping λ"]["data"], EPISODES.dampings, (5, 7), strict=True):
+    for trace, row, count in zip(
+        charts["damping λ"]["data"], EPISODES.dampings, (5, 7), strict=True
+    ):
         np.testing.assert_allclose(trace["y"], row[:count], rtol=1e-6)
-        assert [k for k, symbol in enumerate(trace["marker"]["symbol"]) if symbol.endswith("-open")] == [1]
+        assert [
+            k for k, symbol in enumerate(trace["marker"]["symbol"]) if symbol.endswith("-open")
+        ] == [1]
 
 
 @pytest.mark.extra
@@ -94,7 +126,9 @@ def test_the_page_is_drawn_without_errors_and_without_the_network(tmp_path):
     path.write_text(page_of(), encoding="utf-8")
     with browser.chromium() as page:
         page.get(path.as_uri())
-        count = page.execute_script("return document.querySelectorAll('.scatterlayer .trace').length")
+        count = page.execute_script(
+            "return document.querySelectorAll('.scatterlayer .trace').length"
+        )
         assert count > 2 * len(EPISODES.iterations)
         title = "return document.querySelector('.xtitle').textContent"
         assert page.execute_script(title) == "gradient updates"

@@ -1,8 +1,8 @@
-"""The viewer's page and the one in a file, in headless Chromium: pixels, no error, no request elsewhere.
+"""The viewer's page and the one in a file, in headless Chromium: pixels, no error, no request
+elsewhere.
 
-Points and frusta of a problem without colours are viridis's, what is chosen is orange; software rendering gives them to
-within a few shades.
-"""
+Points and frusta of a problem without colours are viridis's, what is chosen is orange; software
+rendering gives them to within a few shades."""
 
 from __future__ import annotations
 
@@ -25,13 +25,26 @@ CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 
 pytestmark = [
     pytest.mark.extra,
-    pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="needs Debian's packages chromium and chromium-driver"),
+    pytest.mark.skipif(
+        not (CHROMIUM and DRIVER), reason="needs Debian's packages chromium and chromium-driver"
+    ),
     pytest.mark.filterwarnings("default"),  # of viser and its server
 ]
 
 FLAGS = (
-    *("--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *(
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+    ),
+    *(
+        "--disable-component-update",
+        "--disable-sync",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ),
     *("--window-size=900,700", "--disable-dev-shm-usage"),
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )
@@ -82,7 +95,9 @@ def picture(browser) -> np.ndarray:
     """Pixels of the page, shape (height, width, 3)."""
     from PIL import Image
 
-    return np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"), np.int16)
+    return np.asarray(
+        Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"), np.int16
+    )
 
 
 def scene(browser) -> np.ndarray:
@@ -91,7 +106,8 @@ def scene(browser) -> np.ndarray:
 
 
 def coloured(pixels: np.ndarray) -> int:
-    """Number of pixels that are neither grey nor white: points and frusta, not background or text."""
+    """Number of pixels that are neither grey nor white: points and frusta, not background or
+    text."""
     return int((pixels.max(axis=2) - pixels.min(axis=2) > 60).sum())
 
 
@@ -114,14 +130,19 @@ def settled(browser) -> np.ndarray:
 
     def is_still() -> bool:
         looks.append(scene(browser))
-        return coloured(looks[-1]) > 500 and len(looks) > 3 and all((look == looks[-1]).all() for look in looks[-4:])
+        return (
+            coloured(looks[-1]) > 500
+            and len(looks) > 3
+            and all((look == looks[-1]).all() for look in looks[-4:])
+        )
 
     wait_for(is_still, browser)
     return looks[-1]
 
 
 def check_silent(browser, *allowed: str) -> None:
-    """No error on the console, as of a name that does not resolve, and no request but to these origins."""
+    """No error on the console, as of a name that does not resolve, and no request but to these
+    origins."""
     errors = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
     assert errors == []
     asked = []
@@ -130,7 +151,10 @@ def check_silent(browser, *allowed: str) -> None:
         for key in ("request", "url"):
             found = message["params"].get(key)
             url = found.get("url") if isinstance(found, dict) else found
-            if message["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated") and url:
+            if (
+                message["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated")
+                and url
+            ):
                 asked.append(url)
     assert asked
     assert [url for url in asked if not url.startswith((*allowed, "data:", "blob:"))] == []
@@ -186,7 +210,9 @@ def click(browser, at: tuple[int, int]) -> None:
 
     body = browser.find_element("tag name", "body")
     middle = body.size["width"] // 2, body.size["height"] // 2
-    ActionChains(browser).move_to_element_with_offset(body, at[0] - middle[0], at[1] - middle[1]).click().perform()
+    ActionChains(browser).move_to_element_with_offset(
+        body, at[0] - middle[0], at[1] - middle[1]
+    ).click().perform()
 
 
 def test_clicks_move_into_a_camera_and_show_the_track_of_a_point(browser, viewer):
@@ -230,7 +256,9 @@ def test_points_are_left_out_by_error_and_track_length(viewer):
     (stage,) = viewer.stages
     measures, limit = stage.measures, float(np.median(stage.measures.of_point))
     stage.change(errors=(limit, np.inf), lengths=(3, 5))
-    expected = np.flatnonzero((measures.of_point >= limit) & (measures.tracks >= 3) & (measures.tracks <= 5))
+    expected = np.flatnonzero(
+        (measures.of_point >= limit) & (measures.tracks >= 3) & (measures.tracks <= 5)
+    )
     np.testing.assert_array_equal(stage.kept(), expected)
     assert len(stage.layers._nodes["points"].points) == len(expected)
 
@@ -243,12 +271,18 @@ def test_play_goes_through_the_iterations_and_a_picture_is_saved(browser, viewer
     monkeypatch.setattr(page, "FRAME_S", 0.0)
     viewer._run()
     last = viewer.stages[0].shown.recording.last
-    assert (viewer._slider.value, viewer.stages[0].iteration, viewer._playing) == (last, last, False)
+    assert (viewer._slider.value, viewer.stages[0].iteration, viewer._playing) == (
+        last,
+        last,
+        False,
+    )
     browser.get(viewer.url)
     settled(browser)
     (client,) = viewer.server.get_clients().values()
     sent = {}
-    monkeypatch.setattr(client, "send_file_download", lambda name, data, **_: sent.update({name: data}))
+    monkeypatch.setattr(
+        client, "send_file_download", lambda name, data, **_: sent.update({name: data})
+    )
     viewer._save(viser.GuiEvent(client=client, client_id=client.client_id, target=viewer._play))
     from PIL import Image
 
@@ -289,11 +323,19 @@ def test_a_solve_is_watched_while_it_runs(browser, viewer, recording):
 
     browser.get(viewer.url)
     count = recording.last + 1
-    wait_for(lambda: f"iteration {recording.last} of" in browser.find_element("tag name", "body").text, browser)
+    wait_for(
+        lambda: f"iteration {recording.last} of" in browser.find_element("tag name", "body").text,
+        browser,
+    )
     rows = ("state", "cost", "damping", "gain_ratio", "time_s")
-    longer = {name: np.append(getattr(recording, name), getattr(recording, name)[-1]) for name in rows}
+    longer = {
+        name: np.append(getattr(recording, name), getattr(recording, name)[-1]) for name in rows
+    }
     threading.Thread(target=viewer.grow, args=(replace(recording, **longer),)).start()
-    wait_for(lambda: f"iteration {count} of {count}" in browser.find_element("tag name", "body").text, browser)
+    wait_for(
+        lambda: f"iteration {count} of {count}" in browser.find_element("tag name", "body").text,
+        browser,
+    )
 
 
 def test_slider_and_curve_come_with_the_first_iteration(recording):
@@ -324,7 +366,9 @@ def test_residuals_are_segments_of_a_colour_for_each_and_their_worst_rows_are_li
     from jaxba.viewer.words import about_rows
 
     problem = recording.problem
-    bars = residuals.distance(point=[0, 1, 2], point_2=[3, 4, 5], length=[1e-3, 50.0, 1e-3], sigma=0.1)
+    bars = residuals.distance(
+        point=[0, 1, 2], point_2=[3, 4, 5], length=[1e-3, 50.0, 1e-3], sigma=0.1
+    )
     problem = jaxba.with_residual(problem, bars)
     ahead = residuals.baseline(pose=[0, 1], pose_2=[1, 2], length=1.0, sigma=0.1)
     problem = jaxba.with_residual(problem, ahead)
@@ -336,7 +380,10 @@ def test_residuals_are_segments_of_a_colour_for_each_and_their_worst_rows_are_li
         ends = stage._similarity.points(np.asarray(problem.points))[[1, 4]]
         np.testing.assert_allclose(drawn[0][1], ends, atol=1e-5)
         first, second = about_rows(stage)
-        assert f"distance**: cost {costs_of_rows(problem)[0].sum():.5g} of 3 rows; the worst: 1 (" in first
+        assert (
+            f"distance**: cost {costs_of_rows(problem)[0].sum():.5g} of 3 rows; the worst: 1 ("
+            in first
+        )
         assert "rgb(0, 158, 115)" in second
     finally:
         viewer.close()

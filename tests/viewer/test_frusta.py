@@ -19,14 +19,18 @@ def pinhole_problem(model: str) -> BundleProblem:
     """Two cameras of an image of 640 x 480 pixels, without distortion."""
     lens = {"BAL": (500.0, 0.0, 0.0), "PINHOLE": (500.0, 520.0, 320.0, 240.0)}[model]
     middle = np.zeros(2) if model == "BAL" else np.array([320.0, 240.0])
-    cameras = np.array([[0.3, -0.2, 0.1, 0.4, 0.1, -0.3, *lens], [-1.0, 2.0, 0.5, 0.0, 0.2, 0.1, *lens]])
+    cameras = np.array(
+        [[0.3, -0.2, 0.1, 0.4, 0.1, -0.3, *lens], [-1.0, 2.0, 0.5, 0.0, 0.2, 0.1, *lens]]
+    )
     pixels = np.tile(middle + CORNERS * [320.0, 240.0], (2, 1))
     camera = np.repeat([0, 1], 4)
     lenses = None
     if model != "BAL":
         models = (jaxba.CAMERA_MODELS[model],)
         lenses = jaxba.Lenses(np.zeros(2, np.int32), np.ones((1, 4), bool), None, models)
-    return BundleProblem.create(cameras, np.ones((8, 3)), pixels, camera, np.arange(8), lenses=lenses)
+    return BundleProblem.create(
+        cameras, np.ones((8, 3)), pixels, camera, np.arange(8), lenses=lenses
+    )
 
 
 @pytest.mark.parametrize("model", ["BAL", "PINHOLE"])
@@ -34,7 +38,10 @@ def test_corners_of_a_frustum_project_to_the_corners_of_the_image(model):
     problem = pinhole_problem(model)
     frusta, poses = frusta_of(problem), geometry.camera_poses(np.asarray(problem.cameras))
     depth = np.array([depth_of_image(half, 0.2) for half in frusta.half])
-    plane = np.concatenate([CORNERS * frusta.half[:, None], np.ones((2, 4, 1))], axis=2) * depth[:, None, None]
+    plane = (
+        np.concatenate([CORNERS * frusta.half[:, None], np.ones((2, 4, 1))], axis=2)
+        * depth[:, None, None]
+    )
     corners = np.einsum("nij,nkj->nki", poses[:, :, :3], plane) + poses[:, None, :, 3]
     placed = problem.replace(points=corners.reshape(-1, 3))
     middle = 0 if model == "BAL" else [320.0, 240.0]
@@ -51,7 +58,9 @@ def test_a_segment_runs_from_the_measured_towards_the_predicted_pixel(model):
     frusta = frusta_of(problem)
     factor = 7.0
     segments = residual_segments(problem, frusta, problem.observations - predicted, 1, factor)
-    ends = frusta.on_plane(np.asarray(problem.observations)[4:] + factor * np.array([3.0, -2.0]), np.ones(4, int))
+    ends = frusta.on_plane(
+        np.asarray(problem.observations)[4:] + factor * np.array([3.0, -2.0]), np.ones(4, int)
+    )
     np.testing.assert_allclose(segments[:, 1], ends)
 
 
@@ -60,7 +69,9 @@ def test_a_large_residual_ends_outside_of_the_image_but_not_far():
     frusta, residuals = frusta_of(problem), np.full((8, 2), 1e9)
     start, end = residual_segments(problem, frusta, residuals, 0, 1.0).transpose(1, 0, 2)
     assert (np.abs(end) > frusta.half[0]).any(axis=1).all()
-    np.testing.assert_allclose(np.linalg.norm((end - start) * frusta.focal[0], axis=1), np.hypot(640, 480))
+    np.testing.assert_allclose(
+        np.linalg.norm((end - start) * frusta.focal[0], axis=1), np.hypot(640, 480)
+    )
 
 
 def test_on_the_page_cameras_stand_upright_around_the_origin():
@@ -70,15 +81,22 @@ def test_on_the_page_cameras_stand_upright_around_the_origin():
     np.testing.assert_allclose(np.linalg.det(poses[:, :, :3]), 1.0)
     up = -poses[:, :, 1].mean(axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(np.median(similarity.points(np.asarray(problem.points)), axis=0), 0, atol=0.5)
+    np.testing.assert_allclose(
+        np.median(similarity.points(np.asarray(problem.points)), axis=0), 0, atol=0.5
+    )
 
 
 def test_measures_are_those_of_each_image_and_point():
     problem = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=60), 0)
     found, length = measure(problem), np.linalg.norm(geometry.residuals(problem), axis=1)
-    for values, index in ((found.of_image, problem.camera_index), (found.of_point, problem.point_index)):
+    for values, index in (
+        (found.of_image, problem.camera_index),
+        (found.of_point, problem.point_index),
+    ):
         own = np.asarray(index) == 2
         assert values[2] == pytest.approx(np.sqrt(np.mean(length[own] ** 2)))
-    assert found.rmse == pytest.approx(np.sqrt(2 * geometry.cost(problem) / problem.num_observations))
+    assert found.rmse == pytest.approx(
+        np.sqrt(2 * geometry.cost(problem) / problem.num_observations)
+    )
     worst = found.worst()
     assert (np.diff(found.of_image[worst]) <= 0).all()

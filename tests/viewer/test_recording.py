@@ -1,4 +1,5 @@
-"""A recording holds what the solve came to, iteration by iteration, and comes back from its file."""
+"""A recording holds what the solve came to, iteration by iteration, and comes back from its
+file."""
 
 from __future__ import annotations
 
@@ -23,7 +24,11 @@ def problem():
 @pytest.fixture(scope="module")
 def recorded(problem):
     recorder, seen = Recorder(problem, "here"), []
-    watch = lambda record, now: (recorder(record, now), seen.append(record.time_s), time.sleep(SLEPT_S))
+    watch = lambda record, now: (
+        recorder(record, now),
+        seen.append(record.time_s),
+        time.sleep(SLEPT_S),
+    )
     options = jaxba.SolveOptions(max_iterations=6)
     return recorder.recording, jaxba.solve(problem, "ceres", options, watch=watch), seen
 
@@ -128,5 +133,7 @@ def test_names_of_images_are_kept(problem, tmp_path):
 def test_a_figure_shows_cost_and_damping_of_every_iteration(recorded):
     _, solution, _ = recorded
     above, below = solution.plot().axes
-    np.testing.assert_array_equal(above.lines[0].get_ydata(), [solution.initial_cost, *solution.history.cost])
+    np.testing.assert_array_equal(
+        above.lines[0].get_ydata(), [solution.initial_cost, *solution.history.cost]
+    )
     np.testing.assert_array_equal(below.lines[0].get_ydata(), solution.history.damping)

@@ -1,4 +1,5 @@
-"""What files hold for looking at: COLMAP's colours and sizes, names; and one line where that fails."""
+"""What files hold for looking at: COLMAP's colours and sizes, names; and one line where that
+fails."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def test_colours_and_sizes_are_those_that_pycolmap_reads(model, tmp_path):
     for at, number in enumerate(problem.labels.images.tolist()):
         camera = reconstruction.images[number].camera
         np.testing.assert_array_equal(looks.sizes[at], [camera.width, camera.height])
-        np.testing.assert_allclose(looks.principal[at], [camera.principal_point_x, camera.principal_point_y])
+        np.testing.assert_allclose(
+            looks.principal[at], [camera.principal_point_x, camera.principal_point_y]
+        )
 
 
 @pytest.mark.parametrize(

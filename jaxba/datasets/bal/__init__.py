@@ -1,1 +1,2 @@
-"""The BAL data set by name: what there is, where a downloaded problem lies, and how to download one."""
+"""The BAL data set by name: what there is, where a downloaded problem lies, and how to download
+one."""

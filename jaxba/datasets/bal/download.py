@@ -1,4 +1,5 @@
-"""Downloads of BAL problems into the cache folder, resumed where they broke off. Needs the extra `data`."""
+"""Downloads of BAL problems into the cache folder, resumed where they broke off. Needs the extra
+`data`."""
 
 from __future__ import annotations
 
@@ -21,15 +22,18 @@ except ModuleNotFoundError:
     raise ImportError("this needs requests: pip install jaxba[data]") from None
 try:
     import fcntl
-except ModuleNotFoundError:  # not a POSIX system: there two processes must not download the same file
+# not a POSIX system: there two processes must not download the same file
+except ModuleNotFoundError:
     fcntl = None
 
 BASE_URL = "https://grail.cs.washington.edu/projects/bal/data"  # the data set's own server
 TIMEOUT_S = 30.0  # time without any data from the server after which a download fails
-BLOCK_BYTES = 1 << 16  # bytes between two reports of progress; a broken connection loses fewer than that
+# bytes between two reports of progress; a broken connection loses fewer than that
+BLOCK_BYTES = 1 << 16
 
 Report = Callable[[int, int | None], object]
-"""Called with the bytes received so far, and the size of the whole file or None if the server does not report it."""
+"""Called with the bytes received so far, and the size of the whole file or None if the server does
+not report it."""
 
 
 class DownloadError(InputError):
@@ -43,13 +47,19 @@ class UnreachableError(DownloadError):
 def fetch(
     entry: Entry, folder: Path, report: Report, base_url: str = BASE_URL, use_checksum: bool = True
 ) -> tuple[Path, bool]:
-    """The path of a problem in the folder of the data set, and whether it had to be downloaded since it was missing or
-    had a wrong checksum (that is ignored without `use_checksum`, for a mirror that has compressed the files again).
+    """The path of a problem in the folder of the data set, and whether it had to be downloaded
+    since it was missing or had a wrong checksum (that is ignored without `use_checksum`, for a
+    mirror that has compressed the files again).
 
-    The file appears under its name complete and checked, or not at all. After a broken connection the part that was
-    received stays beside it under a hidden name, and the next call resumes it. A file without a checksum must
-    decompress, and its header must have the counts of its name. Raises DownloadError: the download failed; one line."""
-    url, target, partial = f"{base_url.rstrip('/')}/{entry.file}", folder / entry.file, partial_path(entry, folder)
+    The file appears under its name complete and checked, or not at all. After a broken connection
+    the part that was received stays beside it under a hidden name, and the next call resumes it. A
+    file without a checksum must decompress, and its header must have the counts of its name. Raises
+    DownloadError: the download failed; one line."""
+    url, target, partial = (
+        f"{base_url.rstrip('/')}/{entry.file}",
+        folder / entry.file,
+        partial_path(entry, folder),
+    )
     checksum = entry.sha256 if use_checksum else None
     try:
         if _is_there(target, checksum):
@@ -88,13 +98,15 @@ def _is_there(path: Path, checksum: str | None) -> bool:
 
 
 def partial_path(entry: Entry, folder: Path) -> Path:
-    """Path of an unfinished download. It is hidden, so that a pattern such as problem-* does not match it."""
+    """Path of an unfinished download. It is hidden, so that a pattern such as problem-* does not
+    match it."""
     target = folder / entry.file
     return target.with_name(f".{target.name.removesuffix('.txt.bz2')}.part.bz2")
 
 
 def _check(partial: Path, entry: Entry) -> None:
-    """Removes and refuses a file that does not decompress, or whose header has other counts than its name."""
+    """Removes and refuses a file that does not decompress, or whose header has other counts than
+    its name."""
     why = "its header does not fit its name"
     try:
         header = read_bytes(partial)[:100].split(b"\n", 1)[0].split()
@@ -106,19 +118,25 @@ def _check(partial: Path, entry: Entry) -> None:
 
 
 def download_rest(url: str, file: BinaryIO, report: Report) -> None:
-    """Downloads the missing rest of a file that is open to append, or all of it if the server does not resume. After a
-    failure the file keeps what was received. `report` is called after every block. Raises UnreachableError: no
-    response. Raises DownloadError: the server has no such file, or the connection broke."""
+    """Downloads the missing rest of a file that is open to append, or all of it if the server does
+    not resume. After a failure the file keeps what was received. `report` is called after every
+    block. Raises UnreachableError: no response. Raises DownloadError: the server has no such file,
+    or the connection broke."""
     have = file.tell()
     with requests.Session() as session:
         response = _request(session, url, have)
-        if have and response.status_code in (requests.codes.ok, requests.codes.requested_range_not_satisfiable):
+        if have and response.status_code in (
+            requests.codes.ok,
+            requests.codes.requested_range_not_satisfiable,
+        ):
             have = file.truncate(0)
             if response.status_code != requests.codes.ok:
                 response = _request(session, url, have)
         with response:
             if not response.ok:
-                raise DownloadError(f"{response.url}: the server answers {response.status_code} {response.reason}")
+                raise DownloadError(
+                    f"{response.url}: the server answers {response.status_code} {response.reason}"
+                )
             length = response.headers.get("Content-Length", "")
             total = have + int(length) if length.isdecimal() else None
             broken: Exception | None = None
@@ -130,7 +148,9 @@ def download_rest(url: str, file: BinaryIO, report: Report) -> None:
             except HTTPError as error:
                 broken = error
     if broken or (total is not None and have < total):
-        message = f"{url}: the connection broke after {have:,} bytes; the same command goes on from there"
+        message = (
+            f"{url}: the connection broke after {have:,} bytes; the same command goes on from there"
+        )
         raise DownloadError(message) from broken
 
 
@@ -140,7 +160,11 @@ def _request(session: requests.Session, url: str, have: int) -> requests.Respons
         headers["Range"] = f"bytes={have}-"
     try:
         return session.get(url, headers=headers, stream=True, timeout=TIMEOUT_S)
-    except (requests.exceptions.InvalidURL, requests.exceptions.InvalidSchema, requests.exceptions.MissingSchema):
+    except (
+        requests.exceptions.InvalidURL,
+        requests.exceptions.InvalidSchema,
+        requests.exceptions.MissingSchema,
+    ):
         raise UnreachableError(f"{url}: not the address of a web server") from None
     except requests.RequestException as error:
         message = f"cannot reach {urlsplit(url).netloc}: {_cause(error)}; is there a network?"

@@ -1,4 +1,5 @@
-"""The binary files of a COLMAP model. Counts are held against what is left of a file before they are used."""
+"""The binary files of a COLMAP model. Counts are held against what is left of a file before they
+are used."""
 
 from __future__ import annotations
 
@@ -74,13 +75,16 @@ class _Bytes:
         """A count, and as many items."""
         (count,) = self.unpack(_COUNT, f"the number of {where}")
         if count * dtype.itemsize > self.left:
-            self.fail(f"is cut short: the {where} should have {count}, and {self.left} bytes follow")
+            self.fail(
+                f"is cut short: the {where} should have {count}, and {self.left} bytes follow"
+            )
         values = np.frombuffer(self.data, dtype, count, self.at)
         self.at += values.nbytes
         return values
 
     def records(self, smallest: int) -> Iterator[str]:
-        """The place of each record of the file, each of at least `smallest` bytes; with the last one the file ends."""
+        """The place of each record of the file, each of at least `smallest` bytes; with the last
+        one the file ends."""
         count = self.begin(smallest)
         for number in range(count):
             self.about, self._named = f"{self.record} {number + 1} of {count}", False
@@ -93,7 +97,9 @@ class _Bytes:
             self.fail("is empty")
         (count,) = self.unpack(_COUNT, f"the number of {self.record}s")
         if count * smallest > self.left:
-            self.fail(f"is cut short: {count} {self.record}s do not fit into its {len(self.data)} bytes")
+            self.fail(
+                f"is cut short: {count} {self.record}s do not fit into its {len(self.data)} bytes"
+            )
         return count
 
     def end(self, count: int) -> None:
@@ -104,9 +110,10 @@ class _Bytes:
 
 
 def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray, np.ndarray]:
-    """The records of a file by id, in its order; of `points3D` all points and tracks. `part` is the file's name without
-    its ending; `name` is for messages. Raises ProblemError: the file is cut short or too long, or a record cannot be
-    understood; one line that names the file and the record."""
+    """The records of a file by id, in its order; of `points3D` all points and tracks. `part` is the
+    file's name without its ending; `name` is for messages. Raises ProblemError: the file is cut
+    short or too long, or a record cannot be understood; one line that names the file and the
+    record."""
     file, found = _Bytes(read_bytes(path, decompress=False), name, part.removesuffix("3D")[:-1]), {}
     if part == "points3D":
         return _read_points(file)
@@ -141,9 +148,11 @@ def _read_points(file: _Bytes) -> tuple[np.ndarray, np.ndarray]:
     return points, tracks
 
 
-def _blocks(lengths: Int[np.ndarray, " points"]) -> Iterator[tuple[slice, slice, Bool[np.ndarray, " bytes"]]]:
-    """Some points after the other, given how long their tracks are: which points and track elements they are, and which
-    of their bytes are the points', each before its track."""
+def _blocks(
+    lengths: Int[np.ndarray, " points"],
+) -> Iterator[tuple[slice, slice, Bool[np.ndarray, " bytes"]]]:
+    """Some points after the other, given how long their tracks are: which points and track elements
+    they are, and which of their bytes are the points', each before its track."""
     at = 0
     for start in range(0, len(lengths), _BLOCK_POINTS):
         length = lengths[start : start + _BLOCK_POINTS]

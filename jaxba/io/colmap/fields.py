@@ -1,8 +1,10 @@
-"""The fields of a COLMAP model's records, from which its text and its binary files are read and written.
+"""The fields of a COLMAP model's records, from which its text and its binary files are read and
+written.
 
-Both forms have the same fields in the same order. A file of either has two methods, which raise ProblemError:
-`take(fields, what="")` gives the next values, which with `what` are all that is left of a record that is called so;
-`count(field, each)` gives the next value as the number of records of the fields `each` that follow.
+Both forms have the same fields in the same order. A file of either has two methods, which raise
+ProblemError: `take(fields, what="")` gives the next values, which with `what` are all that is left
+of a record that is called so; `count(field, each)` gives the next value as the number of records of
+the fields `each` that follow.
 
 Source: COLMAP, doc/format.rst, and src/colmap/scene/
 reconstruction_io_binary.cc and reconstruction_io_text.cc."""
@@ -17,15 +19,18 @@ from jaxba.io.colmap.model import MODELS, SENSORS, Camera, Frame, Image, Rig, Se
 from jaxba.problem.camera_models import CAMERA_MODELS
 
 Kinds = tuple[Mapping[str, int], str, str]
-"""Numbers in a binary file by their words in text, and what messages say of another word and another number."""
+"""Numbers in a binary file by their words in text, and what messages say of another word and
+another number."""
 
 
 class Fields:
     """Fields that follow one another."""
 
-    def __init__(self, names: str, codes: str, kinds: Kinds | None = None, largest: int | None = None):
-        """Names are separated by commas; codes are those of `struct`, of which `i` is one of the `kinds`; `largest` is
-        that of integers in text, where it is not their type's."""
+    def __init__(
+        self, names: str, codes: str, kinds: Kinds | None = None, largest: int | None = None
+    ):
+        """Names are separated by commas; codes are those of `struct`, of which `i` is one of the
+        `kinds`; `largest` is that of integers in text, where it is not their type's."""
         self.names, self.codes, self.kinds, self.largest = names.split(", "), codes, kinds, largest
         self.struct = struct.Struct(f"<{codes}")
 
@@ -59,7 +64,13 @@ DATUM = Fields("type of a sensor, id of a sensor, id of a datum", "iIQ", SENSOR.
 
 def _read_camera(file: Any) -> Camera:
     identity, number, width, height = file.take(CAMERA)
-    return Camera(identity, MODELS[number], width, height, file.take(PARAMETERS[MODELS[number]], MODELS[number]))
+    return Camera(
+        identity,
+        MODELS[number],
+        width,
+        height,
+        file.take(PARAMETERS[MODELS[number]], MODELS[number]),
+    )
 
 
 def _read_rig(file: Any) -> Rig:
@@ -75,17 +86,25 @@ def _read_rig(file: Any) -> Rig:
 def _read_frame(file: Any) -> Frame:
     identity, rig, *pose = file.take(FRAME)
     return Frame(
-        identity, rig, tuple(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
+        identity,
+        rig,
+        tuple(pose),
+        tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM))),
     )
 
 
-READERS: dict[str, Callable[[Any], Any]] = {"cameras": _read_camera, "rigs": _read_rig, "frames": _read_frame}
+READERS: dict[str, Callable[[Any], Any]] = {
+    "cameras": _read_camera,
+    "rigs": _read_rig,
+    "frames": _read_frame,
+}
 """What reads a record of the files that are read alike in both forms."""
 
 FIRST = {"cameras": CAMERA, "images": IMAGE, "points3D": POINT, "rigs": RIG, "frames": FRAME}
 """The fields with which a record of each file begins."""
 
-Values = Iterator[tuple[Fields, tuple[Any, ...]]]  # fields and their values, one group after the other
+# fields and their values, one group after the other
+Values = Iterator[tuple[Fields, tuple[Any, ...]]]
 
 
 def values(record: Camera | Image | Rig | Frame) -> Values:

@@ -1,8 +1,8 @@
 """Lenses of COLMAP as those of a problem.
 
-A model whose lenses are all of `AS_BAL` becomes a BAL problem, with pixels relative to the principal point: the
-derivatives of BAL's camera are formulas, and its blocks are small. Any other keeps pixels, camera models and numbers.
-"""
+A model whose lenses are all of `AS_BAL` becomes a BAL problem, with pixels relative to the
+principal point: the derivatives of BAL's camera are formulas, and its blocks are small. Any other
+keeps pixels, camera models and numbers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ AS_BAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # BAL's but for principa
 def lenses_of(
     cameras: Sequence[Camera], index: np.ndarray, *, refine_principal_point: bool
 ) -> tuple[Float[np.ndarray, "lenses numbers"], Lenses | None]:
-    """Numbers of lenses, and the lenses of a problem whose images have them; None if every image has its own, and all
-    of it is optimised. As in COLMAP, focal lengths and distortion are optimised, and principal points only if asked
-    for; nothing of a model without a focal length."""
+    """Numbers of lenses, and the lenses of a problem whose images have them; None if every image
+    has its own, and all of it is optimised. As in COLMAP, focal lengths and distortion are
+    optimised, and principal points only if asked for; nothing of a model without a focal length."""
     bal = not refine_principal_point and all(camera.model in AS_BAL for camera in cameras)
     names = ["BAL"] if bal else sorted({camera.model for camera in cameras})
     models = tuple(CAMERA_MODELS[name] for name in names)
@@ -32,7 +32,11 @@ def lenses_of(
     numbers, free = np.zeros((len(cameras), size)), np.zeros((len(cameras), size), bool)
     for at, camera in enumerate(cameras):
         model = CAMERA_MODELS[camera.model]
-        moves = [*model.focal, *model.distortion, *(model.principal_point if refine_principal_point else ())]
+        moves = [
+            *model.focal,
+            *model.distortion,
+            *(model.principal_point if refine_principal_point else ()),
+        ]
         if bal:
             places = [BAL.parameters.index(model.parameters[k]) for k in moves]
             numbers[at, places], free[at, places] = np.array(camera.params)[moves], True
@@ -40,15 +44,21 @@ def lenses_of(
             numbers[at, : len(model)] = camera.params
             free[at, moves if model.focal else []] = True
     if not bal:
-        return numbers, Lenses(index, free, np.array([names.index(camera.model) for camera in cameras]), models)
+        return numbers, Lenses(
+            index, free, np.array([names.index(camera.model) for camera in cameras]), models
+        )
     unshared = len(np.unique(index)) == len(index)
     return numbers, None if unshared and free.all() else Lenses(index, free)
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
-    """A camera with new numbers, which are BAL's if `bal`, where its model has them; the rest stays, bit by bit."""
+    """A camera with new numbers, which are BAL's if `bal`, where its model has them; the rest
+    stays, bit by bit."""
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
     names = CAMERA_MODELS[camera.model].parameters
-    new = {**dict(zip(names, camera.params, strict=True)), **dict(zip(BAL.parameters, lens.tolist(), strict=True))}
+    new = {
+        **dict(zip(names, camera.params, strict=True)),
+        **dict(zip(BAL.parameters, lens.tolist(), strict=True)),
+    }
     return replace(camera, params=tuple(new[name] for name in names))

@@ -1,7 +1,7 @@
 """A `pycolmap.Reconstruction` as a COLMAP model, without files, and a model's numbers back into it.
 
-Every object that pycolmap hands out costs about a microsecond. So only those are asked for that a part of the
-reconstruction needs, and the key-points of an image come together."""
+Every object that pycolmap hands out costs about a microsecond. So only those are asked for that a
+part of the reconstruction needs, and the key-points of an image come together."""
 
 from __future__ import annotations
 
@@ -30,15 +30,19 @@ NAME = "the reconstruction"
 """What messages call it."""
 
 Keys = Shaped[np.ndarray, " keys"]
-"""Key-points of an image, of type `KEY`: in their places those that were read, in others ones that see no point."""
+"""Key-points of an image, of type `KEY`: in their places those that were read, in others ones that
+see no point."""
 
 
-def read_part(reconstruction: Any, images: Iterable[int], points: Iterable[int], min_track: int = 0) -> Model:
+def read_part(
+    reconstruction: Any, images: Iterable[int], points: Iterable[int], min_track: int = 0
+) -> Model:
     """The model of what some images see and of all that sees some points.
 
-    Key-points say what an image sees, and tracks what images besides the given ones see of the points. Images that are
-    not registered are left out. Records are as in the files, but for colours, errors, and poses of images, which are
-    those of their frames; lengths of tracks are those of the whole reconstruction.
+    Key-points say what an image sees, and tracks what images besides the given ones see of the
+    points. Images that are not registered are left out. Records are as in the files, but for
+    colours, errors, and poses of images, which are those of their frames; lengths of tracks are
+    those of the whole reconstruction.
 
     Args:
         reconstruction: a `pycolmap.Reconstruction`.
@@ -54,20 +58,22 @@ def read_part(reconstruction: Any, images: Iterable[int], points: Iterable[int],
 
 
 def read_whole(reconstruction: Any, min_track: int = 0) -> Model:
-    """The model of all registered images and all points. Arguments and errors as for `read_part`."""
+    """The model of all registered images and all points. Arguments and errors as for
+    `read_part`."""
     keys = _keys_of_images(reconstruction, reconstruction.reg_image_ids())
     return _with_points(reconstruction, keys, list(reconstruction.point3D_ids()), min_track)
 
 
 def read_records(reconstruction: Any, images: Iterable[int]) -> Model:
-    """The model of some registered images without key-points and points: their poses, cameras and rigs. Raises
-    ProblemError: as `check_model`."""
+    """The model of some registered images without key-points and points: their poses, cameras and
+    rigs. Raises ProblemError: as `check_model`."""
     keys = {number: np.empty(0, KEY) for number in _registered(reconstruction, images)}
     return _model(reconstruction, keys, np.empty(0, POINT))
 
 
 def write_records(reconstruction: Any, old: Model, new: Model) -> None:
-    """Gives a reconstruction the cameras, rigs and frames of a model that are not as in the model that was read."""
+    """Gives a reconstruction the cameras, rigs and frames of a model that are not as in the model
+    that was read."""
     import pycolmap
 
     def rotation(pose: Pose) -> Any:
@@ -128,12 +134,15 @@ def _no_keys(image: Any) -> Keys:
     return keys
 
 
-def _other_keys(reconstruction: Any, points: Iterable[int], known: dict[int, Keys]) -> dict[int, Keys]:
-    """The key-points of some points in registered images of which none are known yet, by their images. One that says it
-    is of another point than the track does is left out."""
+def _other_keys(
+    reconstruction: Any, points: Iterable[int], known: dict[int, Keys]
+) -> dict[int, Keys]:
+    """The key-points of some points in registered images of which none are known yet, by their
+    images. One that says it is of another point than the track does is left out."""
     import pycolmap
 
-    places: dict[int, tuple[list[int], list[int]]] = {}  # of their key-points in each image, and their points
+    # of their key-points in each image, and their points
+    places: dict[int, tuple[list[int], list[int]]] = {}
     for point in points:
         for element in reconstruction.point3D(point).track.elements:
             image = element.image_id
@@ -153,9 +162,11 @@ def _other_keys(reconstruction: Any, points: Iterable[int], known: dict[int, Key
     return others
 
 
-def _with_points(reconstruction: Any, keys: dict[int, Keys], points: list[int], min_track: int) -> Model:
-    """The model of images with key-points, of the points of these, and of other points; those of short tracks are left
-    out."""
+def _with_points(
+    reconstruction: Any, keys: dict[int, Keys], points: list[int], min_track: int
+) -> Model:
+    """The model of images with key-points, of the points of these, and of other points; those of
+    short tracks are left out."""
     seen = [of["point"][of["point"] != NO_POINT] for of in keys.values()]
     heads = _points(reconstruction, np.unique(np.concatenate([np.array(points, np.uint64), *seen])))
     short = heads["id"][heads["length"] < min_track]
@@ -177,13 +188,17 @@ def _points(reconstruction: Any, ids: Shaped[np.ndarray, " ids"]) -> Shaped[np.n
     return heads
 
 
-def _model(reconstruction: Any, keys: dict[int, Keys], points: Shaped[np.ndarray, " points"]) -> Model:
+def _model(
+    reconstruction: Any, keys: dict[int, Keys], points: Shaped[np.ndarray, " points"]
+) -> Model:
     """The model of some registered images with key-points, and of points."""
     of_ids = {number: reconstruction.image(number) for number in sorted(keys)}
     of_frames = {image.frame_id for image in of_ids.values()}
     frames = {number: _frame_of(reconstruction.frame(number), keys) for number in sorted(of_frames)}
     images = {
-        number: Image(number, frames[image.frame_id].pose, image.camera_id, _name_of(image), keys[number])
+        number: Image(
+            number, frames[image.frame_id].pose, image.camera_id, _name_of(image), keys[number]
+        )
         for number, image in of_ids.items()
     }
     of_rigs = {frame.rig for frame in frames.values()}
@@ -198,7 +213,8 @@ def _model(reconstruction: Any, keys: dict[int, Keys], points: Shaped[np.ndarray
 def _name_of(image: Any) -> bytes:
     try:
         return image.name.encode()
-    except UnicodeDecodeError as error:  # pycolmap gives names as text, in which not every name of a file can be
+    # pycolmap gives names as text, in which not every name of a file can be
+    except UnicodeDecodeError as error:
         return error.object
 
 
@@ -208,7 +224,13 @@ def _pose_of(rigid: Any) -> Pose:
 
 
 def _camera_of(camera: Any) -> Camera:
-    return Camera(camera.camera_id, camera.model.name, camera.width, camera.height, tuple(camera.params.tolist()))
+    return Camera(
+        camera.camera_id,
+        camera.model.name,
+        camera.width,
+        camera.height,
+        tuple(camera.params.tolist()),
+    )
 
 
 def _frame_of(frame: Any, images: Container[int]) -> Frame:

@@ -1,6 +1,8 @@
-"""What the files of a COLMAP model hold, with the model's own ids and names, and the checks of its structure.
+"""What the files of a COLMAP model hold, with the model's own ids and names, and the checks of its
+structure.
 
-Source: COLMAP, doc/format.rst and doc/cameras.rst; numbers of models and sensors as in COLMAP 4.2."""
+Source: COLMAP, doc/format.rst and doc/cameras.rst; numbers of models and sensors as in COLMAP
+4.2."""
 
 from __future__ import annotations
 
@@ -24,8 +26,22 @@ _LONGEST_NAME = 60  # of an image in messages
 
 
 MODELS = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *(
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
+        "FOV",
+    ),
+    *(
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "THIN_PRISM_FISHEYE",
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+    ),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
 """Camera models of COLMAP, of which each has its place as its number in a binary file."""
@@ -35,12 +51,17 @@ NO_POINT = 2**64 - 1  # COLMAP's id of no point; -1 in a text file
 LARGEST_RATIO = 1e6  # of the focal lengths of a lens; a larger one is damage
 CAMERA_SENSOR = 0  # number of the sensor type of cameras
 SENSORS = {"CAMERA": CAMERA_SENSOR, "IMU": 1}  # numbers of sensor types by name
-KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])  # a key-point: pixels, and the id of its point or `NO_POINT`
+# a key-point: pixels, and the id of its point or `NO_POINT`
+KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 
-POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
-"""A point, with the number of elements of its track. As in a binary file, where the track follows."""
+POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+"""A point, with the number of elements of its track. As in a binary file, where the track
+follows."""
 
-TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])  # an element of a track: an image, and which of its key-points
+# an element of a track: an image, and which of its key-points
+TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])
 
 
 @dataclass(frozen=True)
@@ -66,9 +87,12 @@ class Camera:
 
     @property
     def impossible(self) -> str | None:
-        """Its parameters for a message, if they are not finite, focal lengths not positive or too different."""
+        """Its parameters for a message, if they are not finite, focal lengths not positive or too
+        different."""
         focals = self.focals
-        if np.isfinite(self.params).all() and (not focals or 0 < max(focals) <= LARGEST_RATIO * min(focals)):
+        if np.isfinite(self.params).all() and (
+            not focals or 0 < max(focals) <= LARGEST_RATIO * min(focals)
+        ):
             return None
         return f"{', '.join(f'{value:g}' for value in self.params)} ({self.model})"
 
@@ -85,7 +109,10 @@ class Image:
 
     def __str__(self) -> str:
         name = display_name(self.name.decode("utf-8", "backslashreplace"))
-        return f"image {self.id} ({name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + '...'})"
+        return (
+            f"image {self.id} "
+            f"({name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + '...'})"
+        )
 
 
 @dataclass(frozen=True)
@@ -112,7 +139,8 @@ class Frame:
     id: int
     rig: int
     pose: Pose
-    data: tuple[tuple[int, int, int], ...]  # type and id of the sensor, and of what it took (a camera: the image)
+    # type and id of the sensor, and of what it took (a camera: the image)
+    data: tuple[tuple[int, int, int], ...]
 
     @property
     def images(self) -> list[tuple[int, int]]:
@@ -129,7 +157,8 @@ class Model:
     cameras: dict[int, Camera]
     images: dict[int, Image]
     points: Shaped[np.ndarray, " points"]  # of type `POINT`
-    tracks: Shaped[np.ndarray, " elements"] | None  # of type `TRACK`, point after point; None if they were not read
+    # of type `TRACK`, point after point; None if they were not read
+    tracks: Shaped[np.ndarray, " elements"] | None
     rigs: dict[int, Rig] | None  # None before COLMAP 3.12, where all images are registered
     frames: dict[int, Frame] | None
 
@@ -155,8 +184,9 @@ def file_name(folder: str, file: str) -> str:
 
 
 def check_model(model: Model) -> None:
-    """Refuses a damaged structure. Raises ProblemError: an id stands for none or is there twice, an image names no
-    camera or a frame no rig, a pose is not finite or has no rotation; one line that names the file and the record."""
+    """Refuses a damaged structure. Raises ProblemError: an id stands for none or is there twice, an
+    image names no camera or a frame no rig, a pose is not finite or has no rotation; one line that
+    names the file and the record."""
     rigs, frames = model.rigs or {}, model.frames or {}
     for part, records in model.records.items():
         if NO_ID in records:
@@ -168,29 +198,47 @@ def check_model(model: Model) -> None:
         _fail(model, "points3D", f"{NO_POINT} is the id of no point")
     for image in model.images.values():
         if image.camera not in model.cameras:
-            _fail(model, "images", f"{image}: camera {image.camera} is not in {model.file('cameras')}")
+            _fail(
+                model, "images", f"{image}: camera {image.camera} is not in {model.file('cameras')}"
+            )
         _check_pose(model, "images", str(image), image.pose)
     for rig in rigs.values():
         for sensor in rig.sensors:
             if sensor.type == CAMERA_SENSOR and sensor.id not in model.cameras:
-                _fail(model, "rigs", f"rig {rig.id}: camera {sensor.id} is not in {model.file('cameras')}")
+                _fail(
+                    model,
+                    "rigs",
+                    f"rig {rig.id}: camera {sensor.id} is not in {model.file('cameras')}",
+                )
             if sensor.from_rig is not None:
                 _check_pose(model, "rigs", f"rig {rig.id}, sensor {sensor.id}", sensor.from_rig)
     _check_frames(model, rigs, frames)
 
 
 def _check_frames(model: Model, rigs: dict[int, Rig], frames: dict[int, Frame]) -> None:
-    sensors = {rig.id: {(sensor.type, sensor.id) for sensor in rig.sensors} for rig in rigs.values()}
+    sensors = {
+        rig.id: {(sensor.type, sensor.id) for sensor in rig.sensors} for rig in rigs.values()
+    }
     for frame in frames.values():
         if frame.rig not in rigs:
-            _fail(model, "frames", f"frame {frame.id}: rig {frame.rig} is not in {model.file('rigs')}")
+            _fail(
+                model, "frames", f"frame {frame.id}: rig {frame.rig} is not in {model.file('rigs')}"
+            )
         for kind, sensor, datum in frame.data:
             if (kind, sensor) not in sensors[frame.rig]:
-                _fail(model, "frames", f"frame {frame.id}: rig {frame.rig} has no sensor {sensor} of datum {datum}")
+                _fail(
+                    model,
+                    "frames",
+                    f"frame {frame.id}: rig {frame.rig} has no sensor {sensor} of datum {datum}",
+                )
         for camera, identity in frame.images:
             image = model.images.get(identity)
             if image is not None and image.camera != camera:
-                _fail(model, "frames", f"frame {frame.id}: {image} is of camera {image.camera}, not {camera}")
+                _fail(
+                    model,
+                    "frames",
+                    f"frame {frame.id}: {image} is of camera {image.camera}, not {camera}",
+                )
         seen = [str(model.images[image]) for _, image in frame.images[:1] if image in model.images]
         _check_pose(model, "frames", " of ".join([f"frame {frame.id}", *seen]), frame.pose)
     ids = sorted(image for frame in frames.values() for _, image in frame.images)
@@ -202,7 +250,11 @@ def _check_frames(model: Model, rigs: dict[int, Rig], frames: dict[int, Frame]) 
 def _check_pose(model: Model, part: str, record: str, pose: Pose) -> None:
     for field, values in (("qvec", pose[:4]), ("tvec", pose[4:])):
         if not np.isfinite(values).all():
-            _fail(model, part, f"{record}: {field} is not finite: {' '.join(f'{value:g}' for value in values)}")
+            _fail(
+                model,
+                part,
+                f"{record}: {field} is not finite: {' '.join(f'{value:g}' for value in values)}",
+            )
     if not any(pose[:4]):
         _fail(model, part, f"{record}: qvec is zero, which is no rotation")
 

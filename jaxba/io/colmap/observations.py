@@ -1,7 +1,8 @@
 """Which key-point of which image is of which point.
 
-A model says so twice: a key-point names its point, and a point's track its key-points. Key-points are believed, as in
-COLMAP's bundle adjustment: each stands beside its pixel, numbers in tracks go wrong when key-points are sorted."""
+A model says so twice: a key-point names its point, and a point's track its key-points. Key-points
+are believed, as in COLMAP's bundle adjustment: each stands beside its pixel, numbers in tracks go
+wrong when key-points are sorted."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ class Ordered(NamedTuple):
     model: Model
     images: list[Image]
     keys: Shaped[np.ndarray, " keys"]  # key-points of these images, one image after the other
-    first_key: Int[np.ndarray, " images+1"]  # position of the first key-point of each image, and their number
+    # position of the first key-point of each image, and their number
+    first_key: Int[np.ndarray, " images+1"]
     points: Shaped[np.ndarray, " points"]
     order: Int[np.ndarray, " points"]  # positions of the points in their file
 
@@ -40,15 +42,19 @@ class Ordered(NamedTuple):
 
 
 def ordered(model: Model, images: list[Image]) -> Ordered:
-    """Sorts the points and joins the key-points of the registered images, which are sorted by id."""
+    """Sorts the points and joins the key-points of the registered images, which are sorted by
+    id."""
     keys = [image.keys for image in images]
     order = np.argsort(model.points["id"], kind="stable")
     first = np.cumsum([0, *map(len, keys)], dtype=np.int32)
-    return Ordered(model, images, np.concatenate([np.empty(0, KEY), *keys]), first, model.points[order], order)
+    return Ordered(
+        model, images, np.concatenate([np.empty(0, KEY), *keys]), first, model.points[order], order
+    )
 
 
 def find_views(table: Ordered) -> tuple[Views, list[str]]:
-    """Views, sorted by point and key-point, and notes on what was left out and where tracks say something else."""
+    """Views, sorted by point and key-point, and notes on what was left out and where tracks say
+    something else."""
     point, exists = _positions(table.points["id"], table.keys["point"])
     key = np.flatnonzero(exists).astype(np.int32)
     key = key[grouped(point[key], len(table.points))]
@@ -64,12 +70,15 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
 
 
 def _track_notes(table: Ordered, views: Views) -> list[str]:
-    """Lines on points whose tracks are not those of their key-points; none if tracks were not read."""
+    """Lines on points whose tracks are not those of their key-points; none if tracks were not
+    read."""
     heads, elements = table.model.points, table.model.tracks
     if elements is None:
         return []
     point = np.repeat(np.argsort(table.order).astype(np.int32), heads["length"].astype(np.int64))
-    image, registered = _positions(np.array([image.id for image in table.images], np.uint32), elements["image"])
+    image, registered = _positions(
+        np.array([image.id for image in table.images], np.uint32), elements["image"]
+    )
     first, index = table.first_key, elements["key"]
     same = registered & (index < np.append(np.diff(first), 0).astype(index.dtype)[image])
     place = np.where(same, first[image] + index.astype(np.int32), 0)
@@ -83,7 +92,11 @@ def _track_notes(table: Ordered, views: Views) -> list[str]:
     def element(at: int) -> str:
         seen = table.images[image[at]] if registered[at] else None
         where = f"image {elements['image'][at]}" if seen is None else str(seen)
-        size = f", which has {len(seen.keys)}" if seen is not None and index[at] >= len(seen.keys) else ""
+        size = (
+            f", which has {len(seen.keys)}"
+            if seen is not None and index[at] >= len(seen.keys)
+            else ""
+        )
         return f"{table.point_name(int(point[at]))}: key-point {index[at]} of {where}{size}"
 
     def differing(at: int) -> str:
@@ -100,14 +113,16 @@ def _track_notes(table: Ordered, views: Views) -> list[str]:
 
 
 def _positions(ids: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of numbers among sorted ids (0 where they are not), and whether they are among them."""
+    """Positions of numbers among sorted ids (0 where they are not), and whether they are among
+    them."""
     if not len(ids):
         return np.zeros(len(wanted), np.int32), np.zeros(len(wanted), bool)
     span = int(ids[-1]) - int(ids[0]) + 1
     if span <= _SPARSEST * len(ids):
         table = np.full(span + 1, -1, np.int32)
         table[ids - ids[0]] = np.arange(len(ids))
-        at = table[np.minimum(wanted - ids[0], np.array(span, ids.dtype))]  # one below the first becomes very large
+        # one below the first becomes very large
+        at = table[np.minimum(wanted - ids[0], np.array(span, ids.dtype))]
         found = at >= 0
     else:
         at = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1).astype(np.int32)

@@ -1,6 +1,7 @@
 """Poses of a COLMAP model.
 
-COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: poses of a problem are BAL's."""
+COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: poses of a problem are
+BAL's."""
 
 from __future__ import annotations
 
@@ -15,14 +16,17 @@ from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations, colmap_quaternion
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-Pose = tuple[float, ...]  # transform from the world (of a sensor: its rig): quaternion wxyz of any norm, translation
-_WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]  # from the order of `jaxba.problem.geometry` to COLMAP's, and back
+# transform from the world (of a sensor: its rig): quaternion wxyz of any norm, translation
+Pose = tuple[float, ...]
+# from the order of `jaxba.problem.geometry` to COLMAP's, and back
+_WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
 _LARGEST_EXPONENT = 500  # squares of larger numbers overflow float64, whose exponents end at 1023
 _SAME = 1e-6  # poses that differ by less, relatively, are the same
 
 
 def quaternions(poses: Sequence[Pose]) -> Float[np.ndarray, "n 4"]:
-    """Quaternions xyzw of poses, scaled by a power of two where their norm could over- or underflow."""
+    """Quaternions xyzw of poses, scaled by a power of two where their norm could over- or
+    underflow."""
     found = np.array(poses).reshape(-1, 7)[:, _XYZW]
     _, exponents = np.frexp(np.abs(found).max(axis=1, initial=0.0, keepdims=True))
     return np.ldexp(found, np.where(np.abs(exponents) > _LARGEST_EXPONENT, -exponents, 0))

@@ -1,6 +1,7 @@
 """Reads COLMAP models as problems, and says where the parts of a problem stand in its model.
 
-Where the lenses of a problem are BAL's, its pixels are relative to the principal point, which is not optimised."""
+Where the lenses of a problem are BAL's, its pixels are relative to the principal point, which is
+not optimised."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ class Assembled(NamedTuple):
     problem: BundleProblem
     images: list[Image]  # those of the problem's cameras
     points: Int[np.ndarray, " points"]  # positions in `model.points`
-    keys: Int[np.ndarray, " observations"]  # key-points of the observations, by their positions in their images
+    # key-points of the observations, by their positions in their images
+    keys: Int[np.ndarray, " observations"]
     notes: list[str]  # what was left out or mended, one line each
 
 
@@ -40,24 +42,29 @@ class Looks(NamedTuple):
     """What a model holds for looking at, in the order of the problem."""
 
     colours: UInt8[np.ndarray, "points 3"] | None  # red, green and blue of points, if known
-    sizes: Float[np.ndarray, "cameras 2"]  # width and height of images, pixels; 0 where they are not known
+    # width and height of images, pixels; 0 where they are not known
+    sizes: Float[np.ndarray, "cameras 2"]
     principal: Float[np.ndarray, "cameras 2"]  # principal points, pixels from the upper left corner
 
 
-def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point: bool = False) -> BundleProblem:
+def read_colmap(
+    folder: StrPath, *, strict: bool = False, refine_principal_point: bool = False
+) -> BundleProblem:
     """Reads a COLMAP model, binary or text.
 
-    Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera models and numbers;
-    as in COLMAP, focal lengths and distortion are optimised, shared by the images of a camera. If all are
-    SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points stay, they become BAL's lenses, which are faster.
-    Images of one frame of a rig move together. Where cameras are in their rigs is optimised, but for the reference
-    sensor, and in rigs whose reference sensor sees nothing.
+    Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera
+    models and numbers; as in COLMAP, focal lengths and distortion are optimised, shared by the
+    images of a camera. If all are SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points
+    stay, they become BAL's lenses, which are faster. Images of one frame of a rig move together.
+    Where cameras are in their rigs is optimised, but for the reference sensor, and in rigs whose
+    reference sensor sees nothing.
 
-    What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
-    `strict` refuses a model of which a part would be left out. `refine_principal_point` optimises principal points,
-    too; COLMAP's default is no. Raises ProblemError: no model, one whose structure is damaged, a rig that does not say
-    where a camera is, nothing is observed, or a part would be left out and `strict`; one line that names the file, and
-    the record by its id."""
+    What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what
+    and how many. `strict` refuses a model of which a part would be left out.
+    `refine_principal_point` optimises principal points, too; COLMAP's default is no. Raises
+    ProblemError: no model, one whose structure is damaged, a rig that does not say where a camera
+    is, nothing is observed, or a part would be left out and `strict`; one line that names the file,
+    and the record by its id."""
     model = read_model(folder)
     assembled = assemble(model, refine_principal_point=refine_principal_point)
     report(assembled.notes, strict=strict)
@@ -78,7 +85,8 @@ def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
 
 
 def principal_points(folder: StrPath, images: Iterable[int]) -> Float[np.ndarray, "n 2"]:
-    """Principal points of images by id, pixels from the upper left corner. Raises ProblemError: as `read_colmap`."""
+    """Principal points of images by id, pixels from the upper left corner. Raises ProblemError: as
+    `read_colmap`."""
     model = read_model(folder)
     return np.array([model.cameras[model.images[image].camera].principal_point for image in images])
 
@@ -87,37 +95,60 @@ def image_sizes(folder: StrPath, images: Iterable[int]) -> Float[np.ndarray, "n 
     """Width and height of images by id, pixels. Raises ProblemError: as `read_colmap`."""
     model = read_model(folder)
     cameras = [model.cameras[model.images[image].camera] for image in images]
-    return np.array([(camera.width, camera.height) for camera in cameras], np.float64).reshape(-1, 2)
+    return np.array([(camera.width, camera.height) for camera in cameras], np.float64).reshape(
+        -1, 2
+    )
 
 
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
-    """The problem of a model, whose principal points are optimised if asked for. Raises ProblemError: it is not known
-    where a camera is in its rig, a lens cannot be used, or nothing is observed."""
+    """The problem of a model, whose principal points are optimised if asked for. Raises
+    ProblemError: it is not known where a camera is in its rig, a lens cannot be used, or nothing is
+    observed."""
     images, notes = registered(model)
     table = ordered(model, images)
     for camera in sorted({image.camera for image in images}):
         if wrong := model.cameras[camera].impossible:
-            raise ProblemError(f"{model.file('cameras')}: camera {camera} has impossible parameters: {wrong}")
+            raise ProblemError(
+                f"{model.file('cameras')}: camera {camera} has impossible parameters: {wrong}"
+            )
     views, found = find_views(table)
     views, odd = _finite(table, views)
     notes += found + odd
     if not views.size:
-        raise NothingObserved("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
+        raise NothingObserved(
+            "; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]])
+        )
     sees = np.bincount(views[0], minlength=len(images)) > 0
     observed = np.bincount(views[2], minlength=len(table.points)) > 0
     unseen = np.flatnonzero(~observed & np.isfinite(table.points["xyz"]).all(axis=1))
-    seeing, blind = ([one for one, kept in zip(images, mask, strict=True) if kept] for mask in (sees, ~sees))
-    other = [(one, rig) for rig in (model.rigs or {}).values() for one in rig.sensors if one.type != CAMERA_SENSOR]
+    seeing, blind = (
+        [one for one, kept in zip(images, mask, strict=True) if kept] for mask in (sees, ~sees)
+    )
+    other = [
+        (one, rig)
+        for rig in (model.rigs or {}).values()
+        for one in rig.sensors
+        if one.type != CAMERA_SENSOR
+    ]
     name = lambda pair: f"sensor {pair[0].id} of rig {pair[1].id}"
     notes += counted(model.file("images"), blind, "image", "left out, without observations")
-    notes += counted(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
+    notes += counted(
+        model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name
+    )
     notes += counted(model.file("rigs"), other, "sensor", "left out, no camera", name)
     keys = views[1] - table.first_key[views[0]]
     for row, kept in ((0, sees), (2, observed)):
         if not kept.all():
             views[row] = (np.cumsum(kept, dtype=np.int32) - 1)[views[row]]
     points = table.order[observed]
-    problem = _problem(model, seeing, points, table.keys["xy"], views, refine_principal_point=refine_principal_point)
+    problem = _problem(
+        model,
+        seeing,
+        points,
+        table.keys["xy"],
+        views,
+        refine_principal_point=refine_principal_point,
+    )
     return Assembled(problem, seeing, points, keys, notes)
 
 
@@ -140,7 +171,11 @@ def lens_hints(model: Model) -> list[str]:
 def _pose_hints(model: Model) -> list[str]:
     """Whether images have other poses than their frames give them, one line."""
     frames = model.frame_of
-    other = [one for one in model.images.values() if one.id in frames and differ(one.pose, _posed(model, one).pose)]
+    other = [
+        one
+        for one in model.images.values()
+        if one.id in frames and differ(one.pose, _posed(model, one).pose)
+    ]
     where = f"with another pose than in {model.file('frames')}, which counts"
     return counted(model.file("images"), other, "image", where)
 
@@ -152,24 +187,34 @@ def _posed(model: Model, image: Image) -> Image:
 
 
 def registered(model: Model) -> tuple[list[Image], list[str]]:
-    """Registered images by id, in poses of their frames; notes on others. Raises ProblemError as `place_in_rig`."""
+    """Registered images by id, in poses of their frames; notes on others. Raises ProblemError as
+    `place_in_rig`."""
     images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:
         return images, []
     away = [image for image in images if image.id not in frames]
     lost = [frame.id for number, frame in sorted(frames.items()) if number not in model.images]
     notes = counted(model.file("images"), away, "image", "left out, without a frame")
-    notes += counted(model.file("frames"), lost, "frame", "left out, without an image", lambda frame: f"frame {frame}")
+    notes += counted(
+        model.file("frames"),
+        lost,
+        "frame",
+        "left out, without an image",
+        lambda frame: f"frame {frame}",
+    )
     return [_posed(model, image) for image in images if image.id in frames], notes
 
 
 def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
-    """Where a camera is in the rig of a frame; None for the reference sensor. Raises ProblemError: it is not known."""
+    """Where a camera is in the rig of a frame; None for the reference sensor. Raises ProblemError:
+    it is not known."""
     assert model.rigs is not None
     sensors = model.rigs[frame.rig].sensors
     at = next(at for at, one in enumerate(sensors) if (one.type, one.id) == (CAMERA_SENSOR, camera))
     if at and sensors[at].from_rig is None:
-        raise ProblemError(f"{model.file('rigs')}: rig {frame.rig}: it is not known where camera {camera} is in it")
+        raise ProblemError(
+            f"{model.file('rigs')}: rig {frame.rig}: it is not known where camera {camera} is in it"
+        )
     return sensors[at].from_rig if at else None
 
 
@@ -194,10 +239,14 @@ def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     """Views of finite pixels and points, and notes on the others."""
     model, what = table.model, "left out, not finite"
     finite = np.asarray(np.isfinite(table.points["xyz"]).all(axis=1))
-    notes = counted(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
+    notes = counted(
+        model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name
+    )
     views = views if finite.all() else views[:, finite[views[2]]]
     visible = np.asarray(np.isfinite(table.keys["xy"]).all(axis=1))[views[1]]
-    notes += counted(model.file("images"), np.sort(views[1, ~visible]), "key-point", what, table.key_name)
+    notes += counted(
+        model.file("images"), np.sort(views[1, ~visible]), "key-point", what, table.key_name
+    )
     return views if visible.all() else views[:, visible], notes
 
 
@@ -214,7 +263,9 @@ def _problem(
     cameras = sorted({image.camera for image in images})
     lens = np.searchsorted(cameras, [image.camera for image in images])
     used = [model.cameras[camera] for camera in cameras]
-    intrinsics, of_problem = lenses.lenses_of(used, lens, refine_principal_point=refine_principal_point)
+    intrinsics, of_problem = lenses.lenses_of(
+        used, lens, refine_principal_point=refine_principal_point
+    )
     image, key, point = views
     pixels = keys[key]
     if of_problem is None or of_problem.all_bal:
@@ -225,7 +276,9 @@ def _problem(
     parameters = np.hstack([bal_poses([image.pose for image in images]), intrinsics[lens]])
     heads = model.points[points]
     try:
-        problem = BundleProblem.create(parameters, heads["xyz"], pixels, image, point, lenses=of_problem)
+        problem = BundleProblem.create(
+            parameters, heads["xyz"], pixels, image, point, lenses=of_problem
+        )
     except ProblemError as error:
         raise ProblemError(f"{display_name(model.folder)}: {error}") from error
     labels = Labels(

@@ -1,7 +1,8 @@
 """The text files of a COLMAP model.
 
-Comments, empty lines, byte order marks, Windows line ends and blanks at ends do not matter, and a name is all that
-follows the ninth field of its line. Numbers are written with as many digits as reading them back bit by bit needs."""
+Comments, empty lines, byte order marks, Windows line ends and blanks at ends do not matter, and a
+name is all that follows the ninth field of its line. Numbers are written with as many digits as
+reading them back bit by bit needs."""
 
 from __future__ import annotations
 
@@ -41,15 +42,23 @@ class _Line:
     def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
         if what and len(self.rest) != len(fields.names):
             self.fail(f"{what} has {len(fields.names)} parameters, not {len(self.rest)}")
-        return tuple([self._value(name, code, fields) for name, code in zip(fields.names, fields.codes, strict=True)])
+        return tuple(
+            [
+                self._value(name, code, fields)
+                for name, code in zip(fields.names, fields.codes, strict=True)
+            ]
+        )
 
     def count(self, field: str, each: Fields) -> int:
         largest = len(self.rest)  # before the count itself is taken
         return self.numbers([self._word(field)], "I", field, largest)[0]
 
-    def numbers(self, words: list[bytes], code: str, field: str, high: int | None = None) -> list[Any]:
-        """Words of this line as numbers: floats for the code `d`, which may be infinite or no number, else integers in
-        0..`high` (by default the largest of the code), where -1, COLMAP's word for nothing, means `high`."""
+    def numbers(
+        self, words: list[bytes], code: str, field: str, high: int | None = None
+    ) -> list[Any]:
+        """Words of this line as numbers: floats for the code `d`, which may be infinite or no
+        number, else integers in 0..`high` (by default the largest of the code), where -1, COLMAP's
+        word for nothing, means `high`."""
         try:
             if b"_" in self.text:  # Python takes 1_000 for a number
                 raise ValueError
@@ -60,7 +69,9 @@ class _Line:
             return values
         high = _LARGEST[code] if high is None else high
         if min(values) < -1 or max(values) > high:
-            bad = next(word for word, value in zip(words, values, strict=True) if not -1 <= value <= high)
+            bad = next(
+                word for word, value in zip(words, values, strict=True) if not -1 <= value <= high
+            )
             self.fail(f"{shown_word(bad)} is outside 0..{high} ({field})")
         return [high if value < 0 else value for value in values] if min(values) < 0 else values
 
@@ -92,7 +103,8 @@ class _Line:
 
 
 def _lines(path: Path, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
-    """Lines of a file that are no comments, without blanks at their ends; also `empty` ones if asked for."""
+    """Lines of a file that are no comments, without blanks at their ends; also `empty` ones if
+    asked for."""
     for at, line in enumerate(read_text(path).split(b"\n"), 1):
         text = line.strip()
         if (text or empty) and not text.startswith(b"#"):
@@ -100,14 +112,17 @@ def _lines(path: Path, name: str, record: str, *, empty: bool = False) -> Iterat
 
 
 def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray, np.ndarray]:
-    """The records of a file by id, in its order; of `points3D` all points and tracks. The line of an image's key-points
-    may be empty, and missing in the last. Arguments as for `binary.read`. Raises ProblemError: a line cannot be
-    understood; one line that names the file, the line and the field."""
+    """The records of a file by id, in its order; of `points3D` all points and tracks. The line of
+    an image's key-points may be empty, and missing in the last. Arguments as for `binary.read`.
+    Raises ProblemError: a line cannot be understood; one line that names the file, the line and the
+    field."""
     lines = _lines(path, name, part.removesuffix("3D")[:-1], empty=part == "images")
     if part == "points3D":
         return _read_points(lines)
     found = {}
-    for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part](one)) for one in lines):
+    for line, record in (
+        _images(lines) if part == "images" else ((one, fields.READERS[part](one)) for one in lines)
+    ):
         if line.rest:
             line.fail(f"{shown_word(line.rest[0])} is left over")
         if record.id in found:
@@ -121,7 +136,10 @@ def _read_points(lines: Iterator[_Line]) -> tuple[np.ndarray, np.ndarray]:
     for line in lines:
         identity, x, y, z, red, green, blue, error = line.take(fields.POINT)
         if len(line.rest) % 2:
-            line.fail(f"the track has {len(line.rest)} numbers, which are no pairs of IMAGE_ID and POINT2D_IDX")
+            line.fail(
+                f"the track has {len(line.rest)} numbers, which are no pairs of IMAGE_ID and "
+                "POINT2D_IDX"
+            )
         track = line.numbers(line.rest, "I", "IMAGE_ID or POINT2D_IDX of the track")
         heads.append((identity, (x, y, z), (red, green, blue), error, len(track) // 2))
         tracks.extend(zip(track[::2], track[1::2], strict=True))
@@ -164,8 +182,12 @@ def encode(model: Model) -> Iterator[tuple[str, Iterable[bytes]]]:
 def _joined(record: Any) -> bytes:
     words: list[str] = []
     for of, numbers in fields.values(record):
-        kinds = {number: word for word, number in of.kinds[0].items()} if of.kinds is not None else {}
-        words += [kinds[v] if code == "i" else str(v) for code, v in zip(of.codes, numbers, strict=True)]
+        kinds = (
+            {number: word for word, number in of.kinds[0].items()} if of.kinds is not None else {}
+        )
+        words += [
+            kinds[v] if code == "i" else str(v) for code, v in zip(of.codes, numbers, strict=True)
+        ]
     text = " ".join(words).encode()
     if not isinstance(record, Image):
         return text

@@ -1,4 +1,5 @@
-"""Writes a problem as a COLMAP model: into what another model holds besides, or as one that is like no other."""
+"""Writes a problem as a COLMAP model: into what another model holds besides, or as one that is like
+no other."""
 
 from __future__ import annotations
 
@@ -38,27 +39,34 @@ def write_colmap(
 ) -> None:
     """Writes a problem as a COLMAP model.
 
-    All files are first written to a hidden folder; then each replaces the old one whole. They are binary, or text where
-    the other model is and the folder has no binary one. It may be the other's.
+    All files are first written to a hidden folder; then each replaces the old one whole. They are
+    binary, or text where the other model is and the folder has no binary one. It may be the
+    other's.
 
-    With another model, `like`, the problem is as `read_colmap` made it from that one, or a `part` of that, with
-    optimised cameras and points. Poses, points and intrinsics of what is in the problem are replaced, and point errors;
-    all else is written as it was read, also what `read_colmap` left out.
+    With another model, `like`, the problem is as `read_colmap` made it from that one, or a `part`
+    of that, with optimised cameras and points. Poses, points and intrinsics of what is in the
+    problem are replaced, and point errors; all else is written as it was read, also what
+    `read_colmap` left out.
 
-    Without another model, image, camera and point ids count from 1, and images are called `image0001.jpg` and so on.
-    Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and constant.
-    Its image size is made up: the smallest even one that holds all its pixels around the centre, its principal point.
-    Where f is negative, the camera is rolled by 180 degrees instead, which gives the same pixels.
-    Other lenses keep their pixels, models and numbers. Weights, and what is constant, cannot be stored.
+    Without another model, image, camera and point ids count from 1, and images are called
+    `image0001.jpg` and so on. Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE
+    where k2, or k1 and k2, are zero and constant. Its image size is made up: the smallest even one
+    that holds all its pixels around the centre, its principal point. Where f is negative, the
+    camera is rolled by 180 degrees instead, which gives the same pixels. Other lenses keep their
+    pixels, models and numbers. Weights, and what is constant, cannot be stored.
 
-    `rejected` are observations that `read_colmap` made of the other model (`Solution.rejected`): they leave the tracks,
-    and their key-points have no point. Points with fewer than two observations left are dropped.
+    `rejected` are observations that `read_colmap` made of the other model (`Solution.rejected`):
+    they leave the tracks, and their key-points have no point. Points with fewer than two
+    observations left are dropped.
 
-    Raises ProblemError: another model's problem, unstorable, different intrinsics of a camera, unwritable folder.
+    Raises ProblemError: another model's problem, unstorable, different intrinsics of a camera,
+    unwritable folder.
     Raises ValueError: `rejected` without another model, or of another length."""
     if like is None:
         if rejected is not None:
-            raise ValueError("rejected is for a model that is like another one: write problem.subset(~rejected)")
+            raise ValueError(
+                "rejected is for a model that is like another one: write problem.subset(~rejected)"
+            )
         write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
     target = display_name(folder)
@@ -66,14 +74,18 @@ def write_colmap(
     old = assembled.problem
     gone = np.zeros(old.num_observations, bool) if rejected is None else np.asarray(rejected)
     if gone.shape != (old.num_observations,):
-        raise ValueError(f"rejected must have {old.num_observations} entries, has shape {gone.shape}")
-    text = model.suffix == ".txt" and not has_parts(folder, ".bin")  # COLMAP ignores text files beside a binary model
+        raise ValueError(
+            f"rejected must have {old.num_observations} entries, has shape {gone.shape}"
+        )
+    # COLMAP ignores text files beside a binary model
+    text = model.suffix == ".txt" and not has_parts(folder, ".bin")
     model = _without(_with_points(model, assembled, problem, ~gone), assembled, gone)
     write_model(_with_rigs(model), folder, ".txt" if text else ".bin")
 
 
 def check_model(problem: BundleProblem, folder: StrPath) -> None:
-    """Checks, before a solve, that a new COLMAP model can hold a problem. Raises ProblemError: it cannot.
+    """Checks, before a solve, that a new COLMAP model can hold a problem. Raises ProblemError: it
+    cannot.
 
     Args:
         problem: any problem.
@@ -86,12 +98,15 @@ def check_model(problem: BundleProblem, folder: StrPath) -> None:
             raise ProblemError(f"cannot write {target}: COLMAP has no camera model {name}")
     farthest = float(np.abs(problem.observations).max(initial=0.0))
     if farthest > _LARGEST_HALF:
-        raise ProblemError(f"cannot write {target}: a pixel is {farthest:g} from the centre of its image")
+        raise ProblemError(
+            f"cannot write {target}: a pixel is {farthest:g} from the centre of its image"
+        )
 
 
 def _with_positive_focals(problem: BundleProblem) -> BundleProblem:
-    """The problem with BAL's cameras of a negative focal length as cameras of a positive one that are rolled by 180
-    degrees about their view: the same pixels, since `f p` is `(-f)(-p)`. In rigs they stay."""
+    """The problem with BAL's cameras of a negative focal length as cameras of a positive one that
+    are rolled by 180 degrees about their view: the same pixels, since `f p` is `(-f)(-p)`. In rigs
+    they stay."""
     rolled = np.asarray(problem.cameras)[:, 6] < 0
     if not _is_bal(problem) or problem.rigs is not None or not rolled.any():
         return problem
@@ -104,11 +119,14 @@ def _with_positive_focals(problem: BundleProblem) -> BundleProblem:
 
 
 def with_problem(model: Model, problem: BundleProblem, target: str) -> tuple[Model, Assembled]:
-    """A model with the lenses, poses and places in rigs of a problem that was made of it, and what it was made of.
-    `target` is what messages say is written. Raises ProblemError: another model's problem, or unstorable."""
+    """A model with the lenses, poses and places in rigs of a problem that was made of it, and what
+    it was made of. `target` is what messages say is written. Raises ProblemError: another model's
+    problem, or unstorable."""
     assembled = assemble(model, refine_principal_point=not _is_bal(problem))
     if (problem.num_cameras, problem.num_points) != (len(assembled.images), len(assembled.points)):
-        raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(model.folder)}")
+        raise ProblemError(
+            f"cannot write {target}: the problem is not one of {display_name(model.folder)}"
+        )
     check_points(problem, model.points["id"][assembled.points], target)
     return with_cameras(model, assembled.images, problem, target), assembled
 
@@ -122,21 +140,28 @@ def with_cameras(model: Model, images: list[Image], problem: BundleProblem, targ
         problem: may have been optimised.
         target: what messages say is written.
 
-    Raises ProblemError: a pose is not finite, a camera would be impossible, or its images have different lenses."""
+    Raises ProblemError: a pose is not finite, a camera would be impossible, or its images have
+        different lenses."""
     bal = _is_bal(problem)
     problem = _with_positive_focals(problem)
-    _check_finite(np.asarray(problem.cameras)[:, :6], lambda at: f"the pose of {images[at]}", target)
-    model = replace(model, cameras={**model.cameras, **_new_cameras(model, images, problem, bal, target)})
+    _check_finite(
+        np.asarray(problem.cameras)[:, :6], lambda at: f"the pose of {images[at]}", target
+    )
+    model = replace(
+        model, cameras={**model.cameras, **_new_cameras(model, images, problem, bal, target)}
+    )
     return _with_poses(_with_places(model, images, problem), images, problem)
 
 
 def check_points(problem: BundleProblem, ids: Integer[np.ndarray, " points"], target: str) -> None:
-    """Raises ProblemError: a point of a problem, whose points have these ids, is not finite; `target` is what cannot be
-    written."""
+    """Raises ProblemError: a point of a problem, whose points have these ids, is not finite;
+    `target` is what cannot be written."""
     _check_finite(np.asarray(problem.points), lambda at: f"point {ids[at]}", target)
 
 
-def _check_finite(values: Float[np.ndarray, "n numbers"], name: Callable[[int], str], target: str) -> None:
+def _check_finite(
+    values: Float[np.ndarray, "n numbers"], name: Callable[[int], str], target: str
+) -> None:
     finite = np.isfinite(values).all(axis=1)
     if not finite.all():
         raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
@@ -148,13 +173,20 @@ def _is_bal(problem: BundleProblem) -> bool:
 
 
 def _with_points(
-    model: Model, assembled: Assembled, problem: BundleProblem, kept: Bool[np.ndarray, " observations"]
+    model: Model,
+    assembled: Assembled,
+    problem: BundleProblem,
+    kept: Bool[np.ndarray, " observations"],
 ) -> Model:
-    """The model with the points of the problem, and their errors by the observations that are kept."""
+    """The model with the points of the problem, and their errors by the observations that are
+    kept."""
     heads = model.points.copy()
     heads["xyz"][assembled.points] = problem.points
-    names = ("observations", "camera_index", "point_index")  # all of the model, of which some may not have counted
-    problem = problem.replace(**{name: getattr(assembled.problem, name)[kept] for name in names}, whitening=None)
+    # all of the model, of which some may not have counted
+    names = ("observations", "camera_index", "point_index")
+    problem = problem.replace(
+        **{name: getattr(assembled.problem, name)[kept] for name in names}, whitening=None
+    )
     heads["error"][assembled.points] = mean_errors(problem)
     return replace(model, points=heads)
 
@@ -165,13 +197,16 @@ def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observ
         return model
     problem, images, heads = assembled.problem, dict(model.images), model.points
     ids = np.array([image.id for image in assembled.images])[problem.camera_index]
-    code = lambda image, key: np.asarray(image, np.uint64) << np.uint64(32) | np.asarray(key, np.uint64)
+    code = lambda image, key: (
+        np.asarray(image, np.uint64) << np.uint64(32) | np.asarray(key, np.uint64)
+    )
     point = np.repeat(np.arange(len(heads)), heads["length"].astype(np.int64))
     elements = model.tracks
     assert elements is not None
     cut = np.isin(code(elements["image"], elements["key"]), code(ids, assembled.keys)[gone])
     touched = assembled.points[problem.point_index[gone]]
-    left = np.bincount(assembled.points[problem.point_index[~gone]], minlength=len(heads))  # tracks may be wrong
+    # tracks may be wrong
+    left = np.bincount(assembled.points[problem.point_index[~gone]], minlength=len(heads))
     drop = np.zeros(len(heads), bool)
     drop[touched] = left[touched] < MIN_TRACK
     for image in images.values():
@@ -191,19 +226,28 @@ def _new_cameras(
     found: dict[int, np.ndarray] = {}
     for image, lens in zip(images, np.asarray(problem.cameras, np.float64)[:, 6:], strict=True):
         if (found.setdefault(image.camera, lens) != lens).any():
-            raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different intrinsics")
-    cameras = {identity: with_lens(model.cameras[identity], lens, bal=bal) for identity, lens in found.items()}
+            raise ProblemError(
+                f"cannot write {target}: images of camera {image.camera} have different intrinsics"
+            )
+    cameras = {
+        identity: with_lens(model.cameras[identity], lens, bal=bal)
+        for identity, lens in found.items()
+    }
     for camera in cameras.values():
         if wrong := camera.impossible:
-            raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {wrong}")
+            raise ProblemError(
+                f"cannot write {target}: camera {camera.id} would have impossible parameters: "
+                f"{wrong}"
+            )
     return cameras
 
 
 def _with_poses(model: Model, of_problem: list[Image], problem: BundleProblem) -> Model:
-    """The model with the poses of the problem, those that have not changed as they were, bit by bit.
+    """The model with the poses of the problem, those that have not changed as they were, bit by
+    bit.
 
-    The pose of a frame is that of its reference sensor's image if the problem has that, else it follows from another.
-    """
+    The pose of a frame is that of its reference sensor's image if the problem has that, else it
+    follows from another."""
     cameras = np.asarray(problem.cameras, np.float64)[:, :6]
     same = (cameras == bal_poses([image.pose for image in of_problem])).all(axis=1)
     images, frames, changed, known = dict(model.images), dict(model.frames or {}), set(), set()
@@ -216,14 +260,20 @@ def _with_poses(model: Model, of_problem: list[Image], problem: BundleProblem) -
         moved = [pair for pair in frame.images if pair[1] in changed]
         if not moved:
             continue
-        own = [pair for pair in frame.images if place_in_rig(model, frame, pair[0]) is None and pair[1] in known]
+        own = [
+            pair
+            for pair in frame.images
+            if place_in_rig(model, frame, pair[0]) is None and pair[1] in known
+        ]
         camera, image = next((pair for pair in own if pair[1] not in changed), (own or moved)[0])
         place = place_in_rig(model, frame, camera)
         pose = images[image].pose if place is None else composed(inverse(place), images[image].pose)
         frames[frame.id] = replace(frame, pose=pose)
         for camera, image in frame.images:  # also of images that see nothing
             if image in images:
-                images[image] = replace(images[image], pose=composed(place_in_rig(model, frame, camera), pose))
+                images[image] = replace(
+                    images[image], pose=composed(place_in_rig(model, frame, camera), pose)
+                )
     return replace(model, images=images, frames=None if model.frames is None else frames)
 
 
@@ -243,7 +293,11 @@ def _with_places(model: Model, images: list[Image], problem: BundleProblem) -> M
     }
 
     def placed(rig: Rig, sensor: Sensor) -> Sensor:
-        if sensor.from_rig is None or sensor.type != CAMERA_SENSOR or (rig.id, sensor.id) not in moved:
+        if (
+            sensor.from_rig is None
+            or sensor.type != CAMERA_SENSOR
+            or (rig.id, sensor.id) not in moved
+        ):
             return sensor
         pose, turn = moved[rig.id, sensor.id]
         return replace(sensor, from_rig=pose if turn else (*sensor.from_rig[:4], *pose[4:]))
@@ -256,24 +310,38 @@ def _with_places(model: Model, images: list[Image], problem: BundleProblem) -> M
 
 
 def _with_rigs(model: Model) -> Model:
-    """The model with a rig of each camera and a frame of each image, as COLMAP reads one without."""
+    """The model with a rig of each camera and a frame of each image, as COLMAP reads one
+    without."""
     if model.frames is not None:
         return model
-    rigs = {identity: Rig(identity, (Sensor(CAMERA_SENSOR, identity, None),)) for identity in model.cameras}
+    rigs = {
+        identity: Rig(identity, (Sensor(CAMERA_SENSOR, identity, None),))
+        for identity in model.cameras
+    }
     frames = {
-        image.id: Frame(image.id, image.camera, image.pose, ((CAMERA_SENSOR, image.camera, image.id),))
+        image.id: Frame(
+            image.id, image.camera, image.pose, ((CAMERA_SENSOR, image.camera, image.id),)
+        )
         for image in model.images.values()
     }
     return replace(model, rigs=rigs, frames=frames)
 
 
 def create_model(problem: BundleProblem, target: str) -> Model:
-    """A model of the problem's numbers; see `write_colmap` for what is made up. `target` is what messages say is
-    written. Raises ProblemError: the problem is not valid, a focal length is not positive, or a pixel lies too far
-    away."""
-    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
+    """A model of the problem's numbers; see `write_colmap` for what is made up. `target` is what
+    messages say is written. Raises ProblemError: the problem is not valid, a focal length is not
+    positive, or a pixel lies too far away."""
+    arrays = (
+        problem.cameras,
+        problem.points,
+        problem.observations,
+        problem.camera_index,
+        problem.point_index,
+    )
     valid = _with_positive_focals(BundleProblem.create(*arrays, lenses=problem.lenses))
-    cameras, camera_index, point_index = map(np.asarray, (valid.cameras, valid.camera_index, valid.point_index))
+    cameras, camera_index, point_index = map(
+        np.asarray, (valid.cameras, valid.camera_index, valid.point_index)
+    )
     lenses = every_lens(valid)
     wrong = np.flatnonzero(~(cameras[:, 6] > 0))
     if wrong.size:
@@ -290,7 +358,9 @@ def create_model(problem: BundleProblem, target: str) -> Model:
         extent = np.abs(seen["xy"]).max(axis=0, initial=0.0)
         half[at] = np.maximum(half[at], np.ceil(extent / (1.0 if lenses.all_bal else 2.0)))
     if half.max() > _LARGEST_HALF:
-        raise ProblemError(f"cannot write {target}: a pixel is {half.max():g} from the centre of its image")
+        raise ProblemError(
+            f"cannot write {target}: a pixel is {half.max():g} from the centre of its image"
+        )
     for at, seen in zip(lens, of_images, strict=True) if lenses.all_bal else ():
         seen["xy"] = seen["xy"] * COLMAP_FLIP[:2] + half[at]
     tracks = np.empty(len(keys), records.TRACK)
@@ -314,7 +384,8 @@ def create_model(problem: BundleProblem, target: str) -> Model:
 
 
 def mean_errors(problem: BundleProblem) -> Float[np.ndarray, " points"]:
-    """Mean reprojection error of each point, pixels; -1, COLMAP's word for none, where it is not finite."""
+    """Mean reprojection error of each point, pixels; -1, COLMAP's word for none, where it is not
+    finite."""
     total = np.zeros(problem.num_points)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for start in range(0, problem.num_observations, _BLOCK_OBSERVATIONS):
@@ -325,8 +396,11 @@ def mean_errors(problem: BundleProblem) -> Float[np.ndarray, " points"]:
     return np.where(np.isfinite(mean), mean, -1.0)
 
 
-def _camera(number: int, lenses: Lenses, lens: int, numbers: np.ndarray, half: np.ndarray, target: str) -> Camera:
-    """The camera of a lens; of one of BAL the smallest model that has all that is not zero or constant."""
+def _camera(
+    number: int, lenses: Lenses, lens: int, numbers: np.ndarray, half: np.ndarray, target: str
+) -> Camera:
+    """The camera of a lens; of one of BAL the smallest model that has all that is not zero or
+    constant."""
     model, (x, y) = lenses.model_of(lens), half.tolist()
     size = int(2 * x), int(2 * y)
     if not lenses.all_bal:

@@ -1,4 +1,5 @@
-"""A table of the paper: methods on sets of problems, the claims that it tests, and its section of the report."""
+"""A table of the paper: methods on sets of problems, the claims that it tests, and its section of
+the report."""
 
 from __future__ import annotations
 
@@ -18,10 +19,15 @@ from jaxba.paper.results import Row
 from jaxba.paper.runner import TEST, Method, Runner, method_named
 from jaxba.solver.record import Record
 
-CLASSIC, CERES = "classic", "ceres"  # rules with which every table compares: the paper's baseline and Ceres'
-SCENES = Problems("synthetic", ())  # stands for the synthetic scenes, which are played and not solved one by one
-_SECTIONS = Path(__file__).parents[1].joinpath("texts.md").read_text(encoding="utf-8").split("\n## ")[1:]
-TEXTS = {  # what the report says of each table or figure: its title, its heading, and the paragraph below that
+# rules with which every table compares: the paper's baseline and Ceres'
+CLASSIC, CERES = "classic", "ceres"
+# stands for the synthetic scenes, which are played and not solved one by one
+SCENES = Problems("synthetic", ())
+_SECTIONS = (
+    Path(__file__).parents[1].joinpath("texts.md").read_text(encoding="utf-8").split("\n## ")[1:]
+)
+# what the report says of each table or figure: its title, its heading, and the paragraph below that
+TEXTS = {
     name: (title, heading.removeprefix("### "), " ".join(text.split()))
     for head, heading, text in (section.split("\n\n", 2) for section in _SECTIONS)
     for name, _, title in [head.partition(": ")]
@@ -44,10 +50,12 @@ def named(label: str, solver: str, paper: float = math.nan, paper_s: float = mat
     return Line(label, method_named(solver), paper, paper_s)
 
 
-def ours(runner: Runner, paper: float = math.nan, paper_s: float = math.nan, *, elsewhere: bool = False) -> list[Line]:
-    """The lines of every table: the paper's agent as printed and as tuned, which share their twin without learning, and
-    the best agent for lambda alone with its twin; trained on synthetic scenes, or elsewhere: on real problems other
-    than the one to solve."""
+def ours(
+    runner: Runner, paper: float = math.nan, paper_s: float = math.nan, *, elsewhere: bool = False
+) -> list[Line]:
+    """The lines of every table: the paper's agent as printed and as tuned, which share their twin
+    without learning, and the best agent for lambda alone with its twin; trained on synthetic
+    scenes, or elsewhere: on real problems other than the one to solve."""
     made = runner.elsewhere if elsewhere else runner.agent
     return [
         Line("the paper's agent, as printed", made(PRINTED)),
@@ -58,7 +66,9 @@ def ours(runner: Runner, paper: float = math.nan, paper_s: float = math.nan, *, 
     ]
 
 
-def with_twin(label: str, made: Callable[..., Method], *of: str, paper: float, paper_s: float = math.nan) -> list[Line]:
+def with_twin(
+    label: str, made: Callable[..., Method], *of: str, paper: float, paper_s: float = math.nan
+) -> list[Line]:
     """The lines of another solver that the best agent drives, and of its twin without learning."""
     line = Line(f"{label} + ours, scale-free state and guard", made(BEST, *of), paper, paper_s)
     return [line, Line(f"{label} + its twin", made(BEST, *of, twin=True))]
@@ -87,7 +97,11 @@ class Part:
 
     def rows(self, runner: Runner) -> dict[str, Row]:
         """By the name of a method, its row from the results so far, if there are any."""
-        on = runner.row_on_scenes if self.problems is SCENES else lambda m: runner.row_on(self.problems.sources, m)
+        on = (
+            runner.row_on_scenes
+            if self.problems is SCENES
+            else lambda m: runner.row_on(self.problems.sources, m)
+        )
         found = (on(line.method) for line in self.lines)
         return {row.method: row for row in found if row.solves}
 
@@ -101,19 +115,39 @@ class Part:
         if problems.reason or not rows:
             return [f"**{problems.name}**: {f'{problems.reason}.' if problems.reason else NOT_YET}"]
         if problems is SCENES:
-            count = max((len(p.iterations) for p in runner.store.plays if p.scenes == TEST), default=0)
-            title = f"**{count} synthetic scenes** of the kind that the agents train on, none of them seen in training:"
+            count = max(
+                (len(p.iterations) for p in runner.store.plays if p.scenes == TEST), default=0
+            )
+            title = (
+                f"**{count} synthetic scenes** of the kind that the agents train on, none of "
+                "them seen in training:"
+            )
         else:
             names = [source.name for source in problems.sources]
-            title = f"**{problems.name}**, {len(names)} problem{'s' * (len(names) != 1)}: {', '.join(names)}."
+            title = (
+                f"**{problems.name}**, {len(names)} problem{'s' * (len(names) != 1)}: "
+                f"{', '.join(names)}."
+            )
             missing = ", ".join(f"`{name}`" for name in problems.missing)
-            title += f" In the configuration, but not on this machine: {missing}." if missing else ""
-        return [title, _comparison(self.lines, rows), *([self._per_problem(runner)] if self.each else [])]
+            title += (
+                f" In the configuration, but not on this machine: {missing}." if missing else ""
+            )
+        return [
+            title,
+            _comparison(self.lines, rows),
+            *([self._per_problem(runner)] if self.each else []),
+        ]
 
     def _per_problem(self, runner: Runner) -> str:
-        header = ["iterations to convergence / to f\\*(1+1e-3); ✗: not within 100", *(x.label for x in self.lines)]
+        header = [
+            "iterations to convergence / to f\\*(1+1e-3); ✗: not within 100",
+            *(x.label for x in self.lines),
+        ]
         cell = lambda source, line: _cell(runner.row_on([source], line.method))
-        return table(header, [[s.name, *(cell(s, line) for line in self.lines)] for s in self.problems.sources])
+        return table(
+            header,
+            [[s.name, *(cell(s, line) for line in self.lines)] for s in self.problems.sources],
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +156,8 @@ class Table:
 
     name: str  # name for `--only`
     parts: Callable[[Runner], list[Part]]  # sets of problems with their methods and claims
-    values: Callable[[Runner], dict[str, Any]] = lambda _: {}  # that its paragraph in `texts.md` names
+    # that its paragraph in `texts.md` names
+    values: Callable[[Runner], dict[str, Any]] = lambda _: {}
 
     @property
     def title(self) -> str:
@@ -167,11 +202,14 @@ def _cell(row: Row) -> str:
         return "-"
     fraction = f" ({100 * row.success:.0f} %)" if 0 < row.success < 1 else ""
     end = "✗" if row.success == 0 else format_iterations(row.iterations)
-    return f"{end}{fraction} / {'✗' if row.near >= ITERATION_LIMIT else format_iterations(row.near)}"
+    return (
+        f"{end}{fraction} / {'✗' if row.near >= ITERATION_LIMIT else format_iterations(row.near)}"
+    )
 
 
 def _comparison(lines: Sequence[Line], rows: Mapping[str, Row]) -> str:
-    """Every method beside the paper's numbers, and over classic and Ceres' rule; seconds where they were measured."""
+    """Every method beside the paper's numbers, and over classic and Ceres' rule; seconds where they
+    were measured."""
     timed = any(math.isfinite(row.seconds) for row in rows.values())
     header = ["method", "paper", "ours", "seeds: range", "success", "to f\\*(1+1e-3)", "good ends"]
     header += ["of classic: paper", "ours", "of Ceres' rule", *(["paper s", "s"] if timed else [])]
@@ -179,7 +217,9 @@ def _comparison(lines: Sequence[Line], rows: Mapping[str, Row]) -> str:
     over = lambda row, base: row.iterations / rows[base].iterations if base in rows else math.nan
     body = []
     for line in lines:
-        row = rows.get(line.method.name) or Row(line.method.name, *[math.nan] * 6, seeds=0, solves=0)
+        row = rows.get(line.method.name) or Row(
+            line.method.name, *[math.nan] * 6, seeds=0, solves=0
+        )
         spread = "rule" if row.solves else "-"
         if row.seeds:
             spread = f"{row.seeds}: {format_iterations(row.low)} to {format_iterations(row.high)}"

@@ -1,4 +1,5 @@
-"""Small problems, and the figures (curves in `report.FIGURES`): lambdas, performance profiles, convergence."""
+"""Small problems, and the figures (curves in `report.FIGURES`): lambdas, performance profiles,
+convergence."""
 
 from __future__ import annotations
 
@@ -26,11 +27,18 @@ PAPER_SIZE = 5  # cameras and points of the paper's small problem
 
 
 def small_scene(size: int, seed: int) -> Source:
-    """A random scene of as many points as cameras, all seen by all. Its start has the true focal lengths."""
+    """A random scene of as many points as cameras, all seen by all. Its start has the true focal
+    lengths."""
 
     def make() -> BundleProblem:
         config = SceneConfig(
-            size, size, size * size, trajectory="orbit", min_depth=4.0, max_depth=16.0, start_focal=0.0
+            size,
+            size,
+            size * size,
+            trajectory="orbit",
+            min_depth=4.0,
+            max_depth=16.0,
+            start_focal=0.0,
         )
         return random_scene(config, seed)
 
@@ -42,7 +50,11 @@ def _small(runner: Runner) -> list[Part]:
     for size in config.small:
         seeds = range(config.seed, config.seed + config.small_scenes)
         paper = lambda iterations, size=size: iterations if size == PAPER_SIZE else float("nan")
-        lines = [named("classic", CLASSIC, paper(5.0)), named("Ceres' rule", CERES), *ours(runner, paper(4.0))]
+        lines = [
+            named("classic", CLASSIC, paper(5.0)),
+            named("Ceres' rule", CERES),
+            *ours(runner, paper(4.0)),
+        ]
         text = "{}: ours takes four fifths of classic's iterations"
         longer = "{}: ours takes longer in seconds, for the time of inference"
         stated = [
@@ -60,7 +72,9 @@ SMALL = Table("small", _small)
 
 def main_problem(runner: Runner) -> Problems:
     """The largest Ladybug problem on this machine; a random scene if there is none."""
-    families = [real_problems.find(family) for family in runner.config.real.bal if family.name == "Ladybug"]
+    families = [
+        real_problems.find(family) for family in runner.config.real.bal if family.name == "Ladybug"
+    ]
     whole = [source for found in families for source in found.sources if source.make is None]
     cameras = lambda source: int(next(iter(re.findall(r"\d+", source.name)), "0"))
     chosen = max(whole, key=cameras) if whole else sources([runner.config.figures.scene])[0]
@@ -77,15 +91,22 @@ def _chart(runner: Runner) -> list[Part]:
     ]
     text = "Chart: ours takes 8 of classic's 30 iterations"
     stated = [
-        Statement(ratio_claim, f"{text} (tuned)", 8 / 30, f"{agents.OURS.name}{ELSEWHERE}", CLASSIC),
-        Statement(ratio_claim, f"{text} (guarded)", 8 / 30, f"{agents.BEST.name}{ELSEWHERE}", CLASSIC),
+        Statement(
+            ratio_claim, f"{text} (tuned)", 8 / 30, f"{agents.OURS.name}{ELSEWHERE}", CLASSIC
+        ),
+        Statement(
+            ratio_claim, f"{text} (guarded)", 8 / 30, f"{agents.BEST.name}{ELSEWHERE}", CLASSIC
+        ),
     ]
     return [Part(main_problem(runner), lines, stated, repeats=1)]
 
 
 def _profiles(runner: Runner) -> list[Part]:
     config = runner.config
-    scenes = [f"{config.figures.scene}:{config.seed + k + 1}" for k in range(config.figures.profile_scenes)]
+    scenes = [
+        f"{config.figures.scene}:{config.seed + k + 1}"
+        for k in range(config.figures.profile_scenes)
+    ]
     every = Problems("all", (*real_problems.bal(config.real).sources, *sources(scenes)))
     part = Part(every, [named(name, name) for name in (CLASSIC, CERES)] + ours(runner))
 
@@ -98,8 +119,9 @@ def _profiles(runner: Runner) -> list[Part]:
 
 
 def speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> claims.Claim:
-    """The claim on the ratio of our time to classic's, a geometric mean over the problems on which both reach the
-    tolerance. The claim is that ours is faster, or else that it is not; the records are solves of both."""
+    """The claim on the ratio of our time to classic's, a geometric mean over the problems on which
+    both reach the tolerance. The claim is that ours is faster, or else that it is not; the records
+    are solves of both."""
     table = profile.reach_table(records, Target("tau", tau))
     rows = table.get(agents.BEST.name, {}), table.get(CLASSIC, {})
     names = [name for name in rows[0] if name in rows[1]]
@@ -114,9 +136,14 @@ def speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> c
     lower = reached < base if faster else base < reached
     status: claims.Status
     if lower and abs(reached - base) > claims.FRACTION_TOLERANCE:
-        status, detail = "not", f"{detail}, reached on {100 * reached:.0f} % against {100 * base:.0f} %"
+        status, detail = (
+            "not",
+            f"{detail}, reached on {100 * reached:.0f} % against {100 * base:.0f} %",
+        )
     elif faster:
-        status = "reproduced" if seconds <= claims.PARTLY_RATIO else "partly" if seconds < 1 else "not"
+        status = (
+            "reproduced" if seconds <= claims.PARTLY_RATIO else "partly" if seconds < 1 else "not"
+        )
     else:
         alike = claims.PARTLY_RATIO <= seconds <= 1 / claims.PARTLY_RATIO
         status = "reproduced" if alike else "partly" if seconds > 1 else "not"

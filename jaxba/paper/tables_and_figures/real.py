@@ -1,4 +1,5 @@
-"""Tables of real problems: efficiency on KITTI and BAL, agents of synthetic scenes, BAL's families in seconds."""
+"""Tables of real problems: efficiency on KITTI and BAL, agents of synthetic scenes, BAL's families
+in seconds."""
 
 from __future__ import annotations
 
@@ -10,10 +11,21 @@ from jaxba.paper import claims, real_problems
 from jaxba.paper.agents import BEST, FEW, OURS
 from jaxba.paper.claims import Statement, ratio_claim, success_claim, time_claim
 from jaxba.paper.runner import ELSEWHERE, Runner, method_named
-from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Line, Part, Table, named, ours, with_twin
+from jaxba.paper.tables_and_figures.common import (
+    CERES,
+    CLASSIC,
+    Line,
+    Part,
+    Table,
+    named,
+    ours,
+    with_twin,
+)
 
-TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"  # names of our agents, trained elsewhere
-MSE_DIFFERENCE = 0.003  # between DeepLM's mean squared errors with and without ours, at most. Source: the paper
+# names of our agents, trained elsewhere
+TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"
+# between DeepLM's mean squared errors with and without ours, at most. Source: the paper
+MSE_DIFFERENCE = 0.003
 
 
 def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> dict[str, str]:
@@ -25,9 +37,13 @@ def _trained_elsewhere(runner: Runner, sources: Sequence[Source]) -> dict[str, s
         if files
     ]
     if not parts:
-        return {"trained": "There is no other problem of this data set on this machine to train an agent on."}
+        return {
+            "trained": "There is no other problem of this data set on this machine to train an "
+            "agent on."
+        }
     trained = (
-        "The agents of this table are trained on windows of up to 10 cameras and 40 points, with the steps that they "
+        "The agents of this table are trained on windows of up to 10 cameras and 40 points, with "
+        "the steps that they "
         f"drive, and judged on problems that the windows are not of: {'; '.join(parts)}."
     )
     return {"trained": trained}
@@ -50,7 +66,9 @@ def _kitti(runner: Runner) -> list[Part]:
     for agent, what in ((TUNED, "tuned"), (GUARDED, "guarded")):
         text = f"KITTI: ours ({what}) takes a"
         statements += [
-            Statement(ratio_claim, f"{text} fifth of classic's iterations", 14 / 75, agent, CLASSIC),
+            Statement(
+                ratio_claim, f"{text} fifth of classic's iterations", 14 / 75, agent, CLASSIC
+            ),
             Statement(time_claim, f"{text} third of classic's time", 100.2 / 340.0, agent, CLASSIC),
             Statement(success_claim, f"KITTI: ours ({what}) succeeds everywhere", 1.0, agent),
         ]
@@ -72,16 +90,29 @@ def _bal(runner: Runner) -> list[Part]:
     statements = [over(ratio_claim, third, 1 / 3, with_deeplm, "deeplm+ceres")]
     for agent, what in ((TUNED, "tuned"), (GUARDED, "guarded")):
         statements += [
-            over(ratio_claim, f"ours ({what}) takes a fifth of classic's iterations", 0.2, agent, CLASSIC),
-            over(time_claim, f"ours ({what}) takes half of classic's time", 62.04 / 110.0, agent, CLASSIC),
+            over(
+                ratio_claim,
+                f"ours ({what}) takes a fifth of classic's iterations",
+                0.2,
+                agent,
+                CLASSIC,
+            ),
+            over(
+                time_claim,
+                f"ours ({what}) takes half of classic's time",
+                62.04 / 110.0,
+                agent,
+                CLASSIC,
+            ),
             over(success_claim, f"ours ({what}) succeeds everywhere", 1.0, agent, ""),
         ]
     return [Part(real_problems.bal(runner.config.real), lines, statements, _same_error, each=True)]
 
 
 def _same_error(runner: Runner) -> Iterable[claims.Claim]:
-    """The claim on the mean squared error of an observation, pixels squared, twice the final cost over their number:
-    by how much it is larger with the agent, on each problem, the mean over the training runs."""
+    """The claim on the mean squared error of an observation, pixels squared, twice the final cost
+    over their number: by how much it is larger with the agent, on each problem, the mean over the
+    training runs."""
     method, base = runner.elsewhere(BEST, "deeplm"), method_named("deeplm+ceres")
     excess = []
     for source in real_problems.bal(runner.config.real).sources:
@@ -90,15 +121,24 @@ def _same_error(runner: Runner) -> Iterable[claims.Claim]:
         if before and after:
             mean = sum(r.final_cost for r in after) / len(after)
             excess.append(2 * (mean - before[0].final_cost) / before[0].observations)
-    yield claims.error_claim("BAL: ours does not change DeepLM's mean squared error", MSE_DIFFERENCE, excess)
+    yield claims.error_claim(
+        "BAL: ours does not change DeepLM's mean squared error", MSE_DIFFERENCE, excess
+    )
 
 
 def _synthetic(runner: Runner) -> list[Part]:
-    """Source: the paper, tables "Average efficiency improvement" and "Average acceleration using synthetic data for
-    training"."""
+    """Source: the paper, tables "Average efficiency improvement" and "Average acceleration using
+    synthetic data for training"."""
     few = f"ours: trained on {runner.config.agents.trajectories} scenes only"
 
-    def part(problems: real_problems.Problems, paper: float, classic: float, other: str, own: float, alone: float):
+    def part(
+        problems: real_problems.Problems,
+        paper: float,
+        classic: float,
+        other: str,
+        own: float,
+        alone: float,
+    ):
         name, method = {"stba": ("STBA", "stba+stba"), "deeplm": ("DeepLM", "deeplm+ceres")}[other]
         driven = with_twin(name, runner.agent, "auto", other, paper=own)
         lines = [
@@ -112,8 +152,12 @@ def _synthetic(runner: Runner) -> list[Part]:
         text = "Synthetic training, {}: fraction of %s's iterations (%s)"
         stated = [
             Statement(ratio_claim, text % (CLASSIC, "tuned"), paper / classic, OURS.name, CLASSIC),
-            Statement(ratio_claim, text % (CLASSIC, "guarded"), paper / classic, BEST.name, CLASSIC),
-            Statement(ratio_claim, text % (name, "guarded"), own / alone, driven[0].method.name, method),
+            Statement(
+                ratio_claim, text % (CLASSIC, "guarded"), paper / classic, BEST.name, CLASSIC
+            ),
+            Statement(
+                ratio_claim, text % (name, "guarded"), own / alone, driven[0].method.name, method
+            ),
         ]
         return Part(problems, lines, stated)
 
@@ -124,7 +168,8 @@ def _synthetic(runner: Runner) -> list[Part]:
     ]
 
 
-FAMILY_SECONDS = {  # of Ceres-CG, DeepLM, DeepLM with the agent. Source: the paper, on BAL's sub-problems
+# of Ceres-CG, DeepLM, DeepLM with the agent. Source: the paper, on BAL's sub-problems
+FAMILY_SECONDS = {
     "Trafalgar": (65.1, 10.2, 5.6),
     "Ladybug": (46.7, 15.35, 8.1),
     "Dubrovnik": (320.0, 10.0, 4.1),
@@ -144,7 +189,10 @@ def _families(runner: Runner) -> list[Part]:
         ]
         paper = FAMILY_SECONDS.get(family.name)  # the paper has no numbers of other families
         if paper:
-            lines = [*(line._replace(paper_s=x) for line, x in zip(lines[:3], paper, strict=True)), *lines[3:]]
+            lines = [
+                *(line._replace(paper_s=x) for line, x in zip(lines[:3], paper, strict=True)),
+                *lines[3:],
+            ]
         stated = [
             Statement(
                 time_claim,
@@ -162,9 +210,19 @@ def _families(runner: Runner) -> list[Part]:
 
 TABLES = (
     Table(
-        "kitti", _kitti, lambda runner: _trained_elsewhere(runner, real_problems.find(runner.config.real.kitti).sources)
+        "kitti",
+        _kitti,
+        lambda runner: _trained_elsewhere(
+            runner, real_problems.find(runner.config.real.kitti).sources
+        ),
     ),
-    Table("bal", _bal, lambda runner: _trained_elsewhere(runner, real_problems.bal(runner.config.real).sources)),
-    Table("synthetic", _synthetic, lambda runner: {"trajectories": runner.config.agents.trajectories}),
+    Table(
+        "bal",
+        _bal,
+        lambda runner: _trained_elsewhere(runner, real_problems.bal(runner.config.real).sources),
+    ),
+    Table(
+        "synthetic", _synthetic, lambda runner: {"trajectories": runner.config.agents.trajectories}
+    ),
     Table("subproblems", _families),
 )
