@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxba.runtime import compilation
-from jaxba.runtime.executable_cache import PRIVATE
+from jaxba.runtime.executable_cache import CACHE_SETTINGS
 from jaxba.runtime.numerics import numerics
 
 # seconds of processor time after which the process is ended. Those of kitti00vo take fifteen
@@ -48,7 +48,9 @@ def compile_later(wanted: Sequence[Wanted]) -> None:
     """Begins to compile programs, all for one folder, in a process that outlives this one. Does
     nothing where that is not possible, as with a function of a user that cannot be pickled."""
     settings = {
-        name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)
+        name: value
+        for name, value in jax.config.values.items()
+        if not name.startswith(CACHE_SETTINGS)
     }
     with contextlib.suppress(Exception):
         content = pickle.dumps((settings, jnp.result_type(float).name, list(wanted)))

@@ -41,8 +41,18 @@ LIMIT = 1 << 30
 # programs read from disk that a process keeps: a solve has seven, and a mapper's adjuster many
 # sizes
 IN_MEMORY = 128
-# settings of JAX that change no program
-PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
+CACHE_SETTINGS = ("jax_compilation_cache", "jax_persistent_cache")
+"""Beginnings of the names of settings of JAX's own cache."""
+
+UNRELATED_SETTINGS = (
+    *CACHE_SETTINGS,
+    "jax_cpu_enable_async_dispatch",  # the commands switch it off
+    "jax_enable_x64",  # of all threads; that of the thread that compiles counts
+    "jax_platforms",  # the devices themselves count
+    "jax_log",
+    "jax_traceback",
+)
+"""Beginnings of the names of JAX's settings that change no program."""
 
 
 class CachedExecutable(NamedTuple):
@@ -264,7 +274,9 @@ def _environment() -> str:
     """Everything outside a program that decides how it is compiled: JAX's settings, XLA's flags,
     the machine."""
     settings = {
-        name: value for name, value in jax.config.values.items() if not name.startswith(PRIVATE)
+        name: value
+        for name, value in jax.config.values.items()
+        if not name.startswith(UNRELATED_SETTINGS)
     }
     settings["float"] = jnp.result_type(float)  # whether this thread has x64 on
     devices = [

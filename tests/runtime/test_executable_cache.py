@@ -306,6 +306,16 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
 
 
 @pytest.mark.parametrize(
+    "setting", ["jax_cpu_enable_async_dispatch", "jax_platforms", "jax_log_compiles"]
+)
+def test_commands_and_python_find_the_same_programs(folder, monkeypatch, setting):
+    cache = executable_cache.ExecutableCache(folder)
+    before = cache.path_for(double, {}, (jnp.arange(3.0),))
+    monkeypatch.setitem(jax.config.values, setting, "another value")
+    assert cache.path_for(double, {}, (jnp.arange(3.0),)) == before
+
+
+@pytest.mark.parametrize(
     ("function", "static", "argument"),
     [
         (double, {"power": abs}, 1.0),
