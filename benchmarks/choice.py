@@ -80,7 +80,8 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()
-    done, losses = [], []
+    done = []
+    losses = []
     print("problem: solver measured ms (predicted, with the products counted) ...: loss of auto")
     for source in sources(args.problem or [*real_problems(), *LARGE_SCENES]):
         problem = source.read()

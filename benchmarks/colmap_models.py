@@ -61,19 +61,20 @@ def reconstruction(
         for name in CAMERA_MODELS[kind].parameters
     ]
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
-        cameras,
-        in_rig,
-        frames // cameras,
-    )
-    options.num_points3D, options.num_points2D_without_point3D = points, 0
+    options.num_rigs = cameras
+    options.num_cameras_per_rig = in_rig
+    options.num_frames_per_rig = frames // cameras
+    options.num_points3D = points
+    options.num_points2D_without_point3D = 0
     options.camera_width, options.camera_height = SIZE
     options.camera_model_id = getattr(pycolmap.CameraModelId, kind)
     options.camera_params = params
     made = pycolmap.synthesize_dataset(options)
     noise = pycolmap.SyntheticNoiseOptions()
-    noise.point2D_stddev, noise.point3D_stddev = 0.5, 0.02
-    noise.rig_from_world_translation_stddev, noise.rig_from_world_rotation_stddev = 0.02, 0.3
+    noise.point2D_stddev = 0.5
+    noise.point3D_stddev = 0.02
+    noise.rig_from_world_translation_stddev = 0.02
+    noise.rig_from_world_rotation_stddev = 0.3
     pycolmap.synthesize_noise(noise, made)
     return made
 
@@ -98,11 +99,9 @@ def settings(**free: bool) -> tuple[Any, Any]:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     solver = options.ceres.solver_options
     solver.max_num_iterations = 300
-    solver.function_tolerance, solver.gradient_tolerance, solver.parameter_tolerance = (
-        1e-14,
-        1e-12,
-        1e-14,
-    )
+    solver.function_tolerance = 1e-14
+    solver.gradient_tolerance = 1e-12
+    solver.parameter_tolerance = 1e-14
     return options, pycolmap.BundleAdjustmentConfig()
 
 
@@ -138,7 +137,8 @@ def rows(kind: str, args: argparse.Namespace) -> Iterator[tuple[str, str, float,
                 if not options.get("refine_extra_params", True):
                     problem = jaxba.hold(problem, numbers=["distortion"])
                 solution = jaxba.solve(problem, args.policy, TIGHT)
-                start, end = cost_of(made), cost_of(by_colmap(folder, **options))
+                start = cost_of(made)
+                end = cost_of(by_colmap(folder, **options))
                 yield (
                     sharing,
                     free,
@@ -155,11 +155,9 @@ def constraints(args: argparse.Namespace) -> Iterator[tuple[str, float, float]]:
         reconstruction("OPENCV", 2, args.frames, args.points, args.seed).write(folder)
         problem = jaxba.read_colmap(folder)
         assert problem.labels is not None
-        ids, points, lenses = (
-            problem.labels.images.tolist(),
-            problem.labels.points.tolist(),
-            problem.labels.lenses.tolist(),
-        )
+        ids = problem.labels.images.tolist()
+        points = problem.labels.points.tolist()
+        lenses = problem.labels.lenses.tolist()
 
         def poses(config: Any, model: Any) -> None:
             for identity in ids[:2]:
@@ -172,7 +170,9 @@ def constraints(args: argparse.Namespace) -> Iterator[tuple[str, float, float]]:
         def gauge(config: Any, model: Any) -> None:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
 
-        lens = lambda config, model: config.set_constant_cam_intrinsics(lenses[0])
+        def lens(config, model):
+            return config.set_constant_cam_intrinsics(lenses[0])
+
         cases = {
             "two constant poses": (jaxba.hold(problem, poses=[0, 1]), poses),
             "five constant points": (jaxba.hold(problem, points=range(5)), some_points),

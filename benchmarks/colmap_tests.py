@@ -43,22 +43,22 @@ def scene(
 ) -> Any:
     """A scene with noise."""
     pycolmap.set_random_seed(1)
-    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
-        rigs,
-        cameras,
-        frames,
-    )
-    options.num_points3D, options.num_points2D_without_point3D = points, 3
+    options = pycolmap.SyntheticDatasetOptions()
+    noise = pycolmap.SyntheticNoiseOptions()
+    options.num_rigs = rigs
+    options.num_cameras_per_rig = cameras
+    options.num_frames_per_rig = frames
+    options.num_points3D = points
+    options.num_points2D_without_point3D = 3
     options.camera_model_id = getattr(pycolmap.CameraModelId, model)
     if model == "EQUIRECTANGULAR":
-        options.camera_width, options.camera_height, options.camera_params = 1000, 500, [1000, 500]
+        options.camera_width = 1000
+        options.camera_height = 500
+        options.camera_params = [1000, 500]
     found = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
-        0.5,
-        0.02,
-        0.3,
-    )
+    noise.point2D_stddev = 0.5
+    noise.point3D_stddev = 0.02
+    noise.rig_from_world_rotation_stddev = 0.3
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, found)
     return found
@@ -87,7 +87,8 @@ def configured(of: Any, gauge: Any = None, images: list[int] | None = None, **mo
 
 def situations() -> Iterator[Situation]:
     """COLMAP's tests, by their names."""
-    two, three = Gauge.TWO_CAMS_FROM_WORLD, Gauge.THREE_POINTS
+    two = Gauge.TWO_CAMS_FROM_WORLD
+    three = Gauge.THREE_POINTS
 
     def made(
         name: str, of: Any, why: str = "", options: dict[str, Any] | None = None, **more: Any
@@ -100,7 +101,8 @@ def situations() -> Iterator[Situation]:
     flat = "a flat valley: neither converges"
     yield made("TwoView", scene(2), flat, gauge=two)
     yield made("ThreeViewSpherical", scene(3, model="EQUIRECTANGULAR"), gauge=two)
-    rig, many = scene(1, 2, 2), scene(1, 3, 3)
+    rig = scene(1, 2, 2)
+    many = scene(1, 3, 3)
     yield made("TwoViewRig", rig, other, gauge=three)
     yield made("ManyViewRig", many, other, gauge=three)
     sensors = list(next(iter(many.rigs.values())).non_ref_sensors)
@@ -177,11 +179,9 @@ def solved(one: Situation, *, tight: bool) -> tuple[int, float, int, int, float,
     options.print_summary = False
     ceres = options.ceres.solver_options
     if tight:
-        ceres.function_tolerance, ceres.gradient_tolerance, ceres.parameter_tolerance = (
-            1e-15,
-            1e-12,
-            1e-15,
-        )
+        ceres.function_tolerance = 1e-15
+        ceres.gradient_tolerance = 1e-12
+        ceres.parameter_tolerance = 1e-15
         ceres.max_num_iterations = 300
     for name, value in one.options.items():
         setattr(options, name, value)
@@ -218,9 +218,12 @@ def main() -> None:
         "iterations",
         "remark",
     )
-    line = lambda cells: (
-        f"| {' | '.join(cells)} |" if markdown else "  ".join(f"{cell:>14}" for cell in cells)
-    )
+
+    def line(cells):
+        return (
+            f"| {' | '.join(cells)} |" if markdown else "  ".join(f"{cell:>14}" for cell in cells)
+        )
+
     print(line(heading))
     if markdown:
         print(line(["---"] * len(heading)))

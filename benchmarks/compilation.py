@@ -81,7 +81,8 @@ def rows(
 ) -> Iterator[str]:
     """Lines of the table for the parts of a step on a problem."""
     source = sources([location])[0]
-    problem, name = source.read(), parse_solver(solver)
+    problem = source.read()
+    name = parse_solver(solver)
     policy, solve_options = name.build()
     choice = linear_solver if name.method == DEFAULT_METHOD else "auto"
     options = choose_linear_solver(problem, solve_options.step_options(policy), choice)
@@ -90,7 +91,10 @@ def rows(
         layout = jax.device_put(build_layout(problem, options))
         state = jax.jit(step.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
-        propose = lambda la, s, d: step.propose(la, s, d, options)
+
+        def propose(la, s, d):
+            return step.propose(la, s, d, options)
+
         # a separate program, not the one that is timed
         proposal = jax.jit(lambda *given: propose(*given))(*given)
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -103,12 +107,16 @@ def rows(
         if has_repairs(options):
             del parts["try_step"]
             search = first_search(state.cameras, state.points, state.cost, proposal.step)
-            candidate = lambda la, s, p, *rest: try_candidate(
-                la, s, p, options, jnp.zeros((), dtype), *rest
-            )
+
+            def candidate(la, s, p, *rest):
+                return try_candidate(la, s, p, options, jnp.zeros((), dtype), *rest)
+
             parts["candidate"] = (candidate, (layout, state, proposal, search, state.cameras))
         if options.refinement.camera_rounds:
-            cameras = lambda la, c, p: refine_cameras(la, c, p, options)
+
+            def cameras(la, c, p):
+                return refine_cameras(la, c, p, options)
+
             parts["cameras"] = (cameras, (layout, state.cameras, state.points))
         for part, (function, arguments) in parts.items():
             measured = {level: measure(function, arguments, level, repeats) for level in LEVELS}
@@ -132,7 +140,9 @@ WHOLE = (
 def whole(location: str) -> tuple[str, float]:
     """Calls of `jaxba-solve` with `--compilation auto` and `full` without a cache: the line of the
     table, and the ratio of their times."""
-    cells, costs, seconds = f"{Path(location).name[:28]:28s}", [], []
+    cells = f"{Path(location).name[:28]:28s}"
+    costs = []
+    seconds = []
     with tempfile.TemporaryDirectory() as folder:
         for compilation in ("auto", "full"):
             log = Path(folder) / f"{compilation}.json"

@@ -73,7 +73,8 @@ def _repeat(content: bytearray, rng: np.random.Generator) -> None:
 
 
 def _number(content: bytearray, rng: np.random.Generator) -> None:
-    start, new = int(rng.integers(len(content))), NUMBERS[rng.integers(len(NUMBERS))]
+    start = int(rng.integers(len(content)))
+    new = NUMBERS[rng.integers(len(NUMBERS))]
     # counts stand at the beginning, and after it at multiples
     start -= start % len(new) if rng.random() < 0.5 else 0
     content[start : start + len(new)] = new
@@ -132,7 +133,8 @@ def _change_number(parts: list[bytes], at: np.ndarray, rng: np.random.Generator)
         return
     k = numbers[rng.integers(len(numbers))]
     digits = [i for i, c in enumerate(parts[k]) if chr(c).isdigit()]
-    kind, i = rng.integers(4), digits[rng.integers(len(digits))]
+    kind = rng.integers(4)
+    i = digits[rng.integers(len(digits))]
     if kind == 0:
         parts[k] = parts[k][:i] + b"%d" % rng.integers(10) + parts[k][i + 1 :]
     elif kind == 1:
@@ -173,7 +175,8 @@ def damage_folder(folder: Path, rng: np.random.Generator) -> None:
     elif kind < 0.04:
         one.write_bytes(b"")
     elif kind < 0.06:
-        first, second = one.read_bytes(), other.read_bytes()
+        first = one.read_bytes()
+        second = other.read_bytes()
         one.write_bytes(second)
         other.write_bytes(first)
     else:

@@ -61,11 +61,13 @@ TOLERANCES = (1e-3, 1e-4, None)
 DEGREES = (0.0, 0.3, 1.0)
 """Disturbances of windows, one after the other."""
 
-OPTIMISED, UNDISTURBED = "-post", 0.1
+OPTIMISED = "-post"
+UNDISTURBED = 0.1
 """Problems of this name begin at their end, so that their windows are disturbed by so many degrees
 at least."""
 
-WINDOWS, LARGEST_WINDOW = 6, 40
+WINDOWS = 6
+LARGEST_WINDOW = 40
 """Windows of a problem, and cameras of the largest."""
 
 CAMERAS = (20, 60, 170, 400, 1000, 2000)
@@ -97,7 +99,8 @@ def disturbed(problem: BundleProblem, seed: int, degrees: float) -> BundleProble
 def cases(draw: int) -> Iterator[Case]:
     """All problems of a draw, one after the other."""
     for source in sources(real_problems()):
-        problem, rng = source.read(), np.random.default_rng([draw, len(source.name)])
+        problem = source.read()
+        rng = np.random.default_rng([draw, len(source.name)])
         optimised = OPTIMISED in source.name
         yield Case(
             "whole", source.name, disturbed(problem, draw, DEGREES[1]) if optimised else problem
@@ -190,7 +193,8 @@ def rows(runs: dict[str, dict[str, Any]], names: list[str], first: str) -> Itera
                 )
                 for one in dict.fromkeys([name, first, *(y for y in YARDSTICKS if y in names)])
             }
-            mine, theirs = prices[name], prices[first]
+            mine = prices[name]
+            theirs = prices[first]
             both = np.isfinite(mine) & np.isfinite(theirs)
             better = np.min([prices[y] for y in YARDSTICKS if y in prices] or [theirs], axis=0)
             known = np.isfinite(better) & np.isfinite(mine)
@@ -210,7 +214,9 @@ def rows(runs: dict[str, dict[str, Any]], names: list[str], first: str) -> Itera
 def judge(runs: dict[str, dict[str, Any]], solver: str) -> Iterator[str]:
     """How well `distance_to_end` stops solves: a line for each tolerance."""
     for within in (1e-2, 1e-3, 1e-4):
-        covered, taken, whole = [], [], []
+        covered = []
+        taken = []
+        whole = []
         for found in runs.values():
             run = found[solver]
             if not run["converged"]:
@@ -240,7 +246,8 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()
-    names, groups = list(args.solver), defaultdict[str, dict[str, Any]](dict)
+    names = list(args.solver)
+    groups = defaultdict[str, dict[str, Any]](dict)
     lines = args.out.read_text().splitlines() if args.out and args.out.exists() else ()
     known = {(one["draw"], one["name"], one["solver"]): one for one in map(json.loads, lines)}
     for group, name, problem in cases(args.draw):

@@ -72,7 +72,10 @@ seen, too."""
 MARGINS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """Of a predicted advantage, in logarithms."""
 
-FOLDS, WIDTH, EPOCHS, BATCH = 5, 96, 80, 256
+FOLDS = 5
+WIDTH = 96
+EPOCHS = 80
+BATCH = 256
 """Of the networks: folds of the scenes, one network each; units of each of two hidden layers;
 training."""
 
@@ -133,7 +136,9 @@ def play_on(
         after = advance(run, _action(policy, run))
         return jax.tree.map(lambda old, new: jnp.where(_ended(game, run), old, new), run, after)
 
-    under_way = lambda runs: ~jnp.all(jax.vmap(functools.partial(_ended, game))(runs))
+    def under_way(runs):
+        return ~jnp.all(jax.vmap(functools.partial(_ended, game))(runs))
+
     return lax.while_loop(
         under_way, lambda runs: step_groups(turn, runs), first(actions)
     ).iterations
@@ -260,7 +265,9 @@ def _fitted(key: Array, x: Array, y: Array, held: Array, truth: Array) -> Networ
     ]
     steps = max(1, len(x) // BATCH)
     rule = optax.adamw(optax.cosine_decay_schedule(2e-3, EPOCHS * steps), weight_decay=1e-3)
-    loss = lambda network, x, y: jnp.mean(optax.huber_loss(_outputs(network, x), y, delta=0.5))
+
+    def loss(network, x, y):
+        return jnp.mean(optax.huber_loss(_outputs(network, x), y, delta=0.5))
 
     def epoch(carry: Any, key: Array) -> tuple[Any, None]:
         network, state, best, least = carry
@@ -307,15 +314,20 @@ def fit(
     folds."""
     x = labels.seen
     change = np.log(labels.iterations / labels.iterations[:, :1]).astype(np.float32)
-    mean, scale = x.mean(axis=0), x.std(axis=0) + 1e-3
+    mean = x.mean(axis=0)
+    scale = x.std(axis=0) + 1e-3
     x = ((x - mean) / scale).astype(np.float32)
     fold = np.random.default_rng(seed).permutation(labels.scene.max() + 1)[labels.scene] % FOLDS
-    networks, beyond = [], np.zeros_like(change)
+    networks = []
+    beyond = np.zeros_like(change)
     for number in range(FOLDS):
         held = fold == number
         key = jax.random.fold_in(jax.random.key(seed), number)
+
         # rows repeated to one size, so that all folds share a program
-        pad = lambda rows, size: jnp.asarray(rows[np.arange(size) % len(rows)])
+        def pad(rows, size):
+            return jnp.asarray(rows[np.arange(size) % len(rows)])
+
         sizes = (
             max((fold != k).sum() for k in range(FOLDS)),
             max((fold == k).sum() for k in range(FOLDS)),
@@ -329,8 +341,12 @@ def fit(
         networks.append(_fitted(key, *parts))
         beyond[held] = _outputs(networks[-1], jnp.asarray(x[held]))
     beyond[:, 0] = 0
-    best, rows = beyond.argmin(axis=1), np.arange(len(beyond))
-    paid = lambda margin: change[rows, np.where(beyond[rows, best] < -margin, best, 0)].mean()
+    best = beyond.argmin(axis=1)
+    rows = np.arange(len(beyond))
+
+    def paid(margin):
+        return change[rows, np.where(beyond[rows, best] < -margin, best, 0)].mean()
+
     margin = min(MARGINS, key=paid)
     spread = np.maximum(change[:, 1:].var(axis=0), 1e-9)
     explained = 1 - ((beyond - change)[:, 1:] ** 2).mean(axis=0) / spread
@@ -345,7 +361,10 @@ def fit(
 def row(args: Arguments, step: str) -> tuple[str, ...]:
     """One row of the table."""
     began = time.perf_counter()
-    say = lambda text: print(f"{time.perf_counter() - began:5.0f} s  {text}", flush=True)
+
+    def say(text):
+        return print(f"{time.perf_counter() - began:5.0f} s  {text}", flush=True)
+
     agent = replace(AgentConfig() if step == "plain" else embedded(), **FREE)
     kind = SceneClass(10, 80, family="windows") if args.problems else SceneClass(10, 40)
     bank_config = BankConfig(kind, args.scenes, problems=tuple(map(str, args.problems)))
@@ -362,7 +381,10 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     actions = np.array([[action_of(agent, jnp.float32(decades))] for decades in DECADES]).clip(
         -1, 1
     )
-    game = lambda bank: make_game(rules, kind, bank, 1, bank_config.options)
+
+    def game(bank):
+        return make_game(rules, kind, bank, 1, bank_config.options)
+
     labels = collect(game(split.train), base, actions, args.seed)
     hindsight = np.exp(np.log(labels.iterations.min(axis=1) / labels.iterations[:, 0]).mean())
     say(f"{len(labels.scene)} states; the best first action of each in hindsight {hindsight:.3f}")
@@ -376,7 +398,10 @@ def row(args: Arguments, step: str) -> tuple[str, ...]:
     ):
         taken[name], _ = look_ahead(game(split.held_out), one, actions, looks)
         say(f"{name}: {np.exp(np.log(taken[name]).mean()):.2f} iterations")
-    shown = lambda name: "{:.3f} [{:.3f}, {:.3f}]".format(*paired_ratio(taken[name], taken["base"]))
+
+    def shown(name):
+        return "{:.3f} [{:.3f}, {:.3f}]".format(*paired_ratio(taken[name], taken["base"]))
+
     damping = 10 ** (0.5 * (agent.low + agent.high) + 0.5 * (agent.high - agent.low) * constant)
     source = f"{len(args.problems)} problems" if args.problems else "random"
     count = f"{len(split.train.initial_cost)} + {len(split.held_out.initial_cost)}"

@@ -102,7 +102,8 @@ def run_case(
     Returns:
         "refused", "solved" or "read"; or "VIOLATED" and what was.
     """
-    given, out = folder / "in", folder / "out"
+    given = folder / "in"
+    out = folder / "out"
     for path in (given, out):
         shutil.rmtree(path, ignore_errors=True)
     shutil.copytree(masters / kind.name, given)
@@ -113,7 +114,9 @@ def run_case(
         word.replace("IN", str(given), 1).replace("OUT", str(out), 1) for word in kind.arguments
     ]
     command = importlib.import_module(f"jaxba.cli.{kind.command}")
-    said, complained, started = io.StringIO(), io.StringIO(), time.process_time()
+    said = io.StringIO()
+    complained = io.StringIO()
+    started = time.process_time()
     try:
         with redirect_stdout(said), redirect_stderr(complained):
             status = command.run(arguments)
@@ -122,10 +125,8 @@ def run_case(
     except BaseException:
         return "VIOLATED", f"raised {traceback.format_exc().strip()}"
     seconds = time.process_time() - started
-    lines, files = (
-        complained.getvalue().splitlines(),
-        [path for path in out.rglob("*") if path.is_file()],
-    )
+    lines = complained.getvalue().splitlines()
+    files = [path for path in out.rglob("*") if path.is_file()]
     if status == 2:
         wrong = {
             f"{len(lines)} lines: {lines}": len(lines) != 1 or not lines[0].startswith("error: "),
@@ -162,7 +163,9 @@ def work(pipe: connection.Connection, folder: Path, args: Arguments) -> None:
     from jaxba.bench import run
     from jaxba.training import task
 
-    masters, kinds, seed = folder / "masters", kinds_of(args), args.seed
+    masters = folder / "masters"
+    kinds = kinds_of(args)
+    seed = args.seed
     with mock.patch.object(task, "build", _began), mock.patch.object(run, "execute", _began):
         warnings.simplefilter("always")  # so that each is seen by its own case
         run_case(INPUTS[0], folder, masters, seed, None)  # imports and compiles
@@ -196,7 +199,10 @@ class Worker:
     """A process for cases, which is begun anew after it died, hung, or has run many."""
 
     def __init__(self, folder: Path, args: Arguments) -> None:
-        self.folder, self.args, self.process, self.count = folder, args, None, 0
+        self.folder = folder
+        self.args = args
+        self.process = None
+        self.count = 0
 
     def run(self, number: int) -> tuple[str, str, str]:
         """Runs a case: name of its input, what became of it, and why."""

@@ -20,7 +20,10 @@ from jaxba.scenes import SceneConfig, random_scene
 from jaxba.settings import configurations
 
 SCENE = random_scene(SceneConfig(6, 40, 160), 0)
-IMAGES, IMAGE_SIZE, FOCAL, SPEED = 4, (160, 96), 120.0, 0.15
+IMAGES = 4
+IMAGE_SIZE = (160, 96)
+FOCAL = 120.0
+SPEED = 0.15
 
 
 @dataclass(frozen=True)
@@ -142,9 +145,11 @@ def _solved(name: str, make: Callable[[Path], None], file: str, weight: int = 1)
 def _read(
     name: str, kind: configurations.Kind, configuration: str, option: str, weight: int
 ) -> Input:
-    make = lambda folder: (folder / "a.yaml").write_bytes(
-        configurations.find(kind, configuration).read_bytes()
-    )
+    def make(folder):
+        return (folder / "a.yaml").write_bytes(
+            configurations.find(kind, configuration).read_bytes()
+        )
+
     return Input(name, make, kind, (option, "IN/a.yaml", "--out", "OUT/run"), weight)
 
 

@@ -62,7 +62,8 @@ def measure(observations: int, args: argparse.Namespace) -> dict[str, Any]:
     )
     if devices > 1:
         jax.config.update("jax_num_cpu_devices", devices)
-    costs, times = [], []
+    costs = []
+    times = []
 
     def note(record: jaxba.IterationRecord) -> None:
         costs.append(record.step.cost)
@@ -135,7 +136,8 @@ def main() -> None:
             ]
         )
         peer = ceres(size, args.iterations) if size <= 1000 * args.ceres else None
-        costs, times = row.pop("costs"), row.pop("times")
+        costs = row.pop("costs")
+        times = row.pop("times")
         row["ceres_s"] = peer and peer.seconds_per_iteration
         if peer and costs:
             goal = (1 + WITHIN) * min(*costs, *peer.costs)

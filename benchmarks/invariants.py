@@ -150,7 +150,8 @@ def count_violations(
         kind, scenes, costs, info_of(kind, scenes, costs, iterations), policy, step, iterations
     )
     ends = scenes._replace(cameras=found.state.cameras, points=found.state.points)
-    anew, last = np.asarray(initial_costs(kind, ends)), np.asarray(found.state.cost)
+    anew = np.asarray(initial_costs(kind, ends))
+    last = np.asarray(found.state.cost)
     counts = {field: int(np.sum(getattr(found, field))) for field in Found._fields[:-1]}
     pixels = np.linalg.norm(
         np.where(np.asarray(scenes.mask)[:, None], scenes.pixels, 0), axis=(1, 2)

@@ -50,12 +50,14 @@ def measure(what: str, path: str, sizes: tuple[int, int, int]) -> None:
     """Runs one measurement in this process and prints its line."""
     problem = synthetic(*sizes) if what == "write" else None
     Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
-    before, start = resident("VmRSS"), time.perf_counter()
+    before = resident("VmRSS")
+    start = time.perf_counter()
     if problem is None:
         problem = read_problem(path)
     else:
         write_problem(problem, path)
-    seconds, beyond = time.perf_counter() - start, resident("VmHWM") - before
+    seconds = time.perf_counter() - start
+    beyond = resident("VmHWM") - before
     names = ("cameras", "points", "observations", "camera_index", "point_index")
     own = sum(np.asarray(getattr(problem, name)).nbytes for name in names)
     beyond -= own if what == "read" else 0

@@ -94,7 +94,8 @@ class Trainings:
             else ["--config", "default", "--set", *SETTINGS]
         )
         command = [sys.executable, "-c", COMMAND, *arguments]
-        pipe, both = subprocess.PIPE, subprocess.STDOUT
+        pipe = subprocess.PIPE
+        both = subprocess.STDOUT
         return subprocess.Popen(
             command,
             env=self.environment,
@@ -110,7 +111,9 @@ class Trainings:
         Raises:
             RuntimeError: it failed, with what it printed.
         """
-        started, times, printed = time.perf_counter(), [], []
+        started = time.perf_counter()
+        times = []
+        printed = []
         with self.begin(run) as process:
             assert process.stdout is not None
             for line in process.stdout:
@@ -160,9 +163,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("two unbroken trainings differ")
             return 1
         last = len(expected[1])
-        kills, runs, stages = 0, 0, Counter[str]()
+        kills = 0
+        runs = 0
+        stages = Counter[str]()
         while kills < args.times:
-            run, runs = Path(name) / f"run-{runs}", runs + 1
+            run = Path(name) / f"run-{runs}"
+            runs = runs + 1
             for _ in range(min(args.per_run, args.times - kills)):
                 left = last - max(checkpoint.steps(run / CHECKPOINTS), default=0)
                 line = int(

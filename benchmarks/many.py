@@ -41,7 +41,8 @@ FILES = (
 )
 """Problems that windows are cut from."""
 
-CAMERAS, POINTS = (5, 20), (50, 500)
+CAMERAS = (5, 20)
+POINTS = (50, 500)
 """Sizes of windows."""
 
 MAPPED = 16
@@ -53,12 +54,14 @@ FEWEST = 6
 
 def windows(count: int, seed: int = 0) -> Iterator[BundleProblem]:
     """Windows of the problems in turn."""
-    folder, rng = Path(os.environ["JAXBA_DATA"]), np.random.default_rng(seed)
+    folder = Path(os.environ["JAXBA_DATA"])
+    rng = np.random.default_rng(seed)
     whole = [one.read() for one in sources([str(folder / f"{name}.txt.bz2") for name in FILES])]
     linked = [covisible(problem) for problem in whole]
     done = 0
     while done < count:
-        problem, shared = whole[done % len(whole)], linked[done % len(whole)]
+        problem = whole[done % len(whole)]
+        shared = linked[done % len(whole)]
         chosen = [int(rng.integers(problem.num_cameras))]
         score = shared[chosen[0]].astype(float)
         for _ in range(int(rng.integers(CAMERAS[0], CAMERAS[1] + 1)) - 1):
@@ -81,7 +84,9 @@ def windows(count: int, seed: int = 0) -> Iterator[BundleProblem]:
 
 def ceres_seconds(problems: list[BundleProblem]) -> tuple[list[float], list[float]]:
     """Ceres' seconds and final costs; none without the program."""
-    program, seconds, costs = peers.program(), [], []
+    program = peers.program()
+    seconds = []
+    costs = []
     if program is None:
         return seconds, costs
     with tempfile.TemporaryDirectory() as folder:
@@ -100,15 +105,19 @@ def pycolmap_seconds(problems: list[BundleProblem]) -> list[float]:
         import pycolmap
     except ImportError:
         return []
-    options, seconds = pycolmap.BundleAdjustmentOptions(), []
+    options = pycolmap.BundleAdjustmentOptions()
+    seconds = []
     options.print_summary = False
     ceres = options.ceres.solver_options
-    ceres.function_tolerance, ceres.num_threads, ceres.max_num_iterations = 1e-6, 1, 100
+    ceres.function_tolerance = 1e-6
+    ceres.num_threads = 1
+    ceres.max_num_iterations = 100
     with tempfile.TemporaryDirectory() as folder:
         for number, problem in enumerate(problems):
             path = Path(folder) / str(number)
             jaxba.write_colmap(problem, path)
-            model, config = pycolmap.Reconstruction(path), pycolmap.BundleAdjustmentConfig()
+            model = pycolmap.Reconstruction(path)
+            config = pycolmap.BundleAdjustmentConfig()
             for image in model.images:
                 config.add_image(image)
             began = time.perf_counter()
@@ -123,7 +132,8 @@ def mapped_rate(problems: list[BundleProblem], policy: str) -> float:
     sizes = [Sizes.of(one)[:4] for one in problems]
     capacity = Sizes._make([*np.max(sizes, axis=0).tolist(), 0]).capacity
     setups = [set_up(one, policy, capacity=capacity) for one in problems]
-    options, tolerances = setups[0].options, jaxba.Tolerances()
+    options = setups[0].options
+    tolerances = jaxba.Tolerances()
 
     def solved(layout: jaxba.Layout, cameras: jax.Array, points: jax.Array) -> jax.Array:
         state = state_of(layout, cameras, points, options, np.float64)
@@ -167,7 +177,9 @@ def main() -> None:
     if by_colmap := pycolmap_seconds(few):
         print(f"pycolmap, two processes: {2 / np.mean(by_colmap):.1f} a second")
 
-    began, times, found = time.perf_counter(), [], []
+    began = time.perf_counter()
+    times = []
+    found = []
     for result in jaxba.solve_many(problems, args.policy):
         times.append(time.perf_counter() - began)
         found.append(result)
@@ -194,7 +206,8 @@ def main() -> None:
         f"{np.mean([one.iterations == 100 for one in solved]):.0%}"
     )
 
-    options, alone = jaxba.SolveOptions(compilation="quick"), []
+    options = jaxba.SolveOptions(compilation="quick")
+    alone = []
     began = time.perf_counter()
     for problem in few[:100]:
         alone.append(jaxba.solve(problem, args.policy, options))

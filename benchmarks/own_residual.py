@@ -26,7 +26,8 @@ OPTIONS = jaxba.SolveOptions(
 def projection(pose, lens, point, *, pixel):
     """BAL's model, from the camera's frame with y down and z forward."""
     x, y, z = pose.to_camera(point)
-    u, v = x / z, -y / z
+    u = x / z
+    v = -y / z
     square = u * u + v * v
     scale = lens.numbers[0] * (1 + lens.numbers[1] * square + lens.numbers[2] * square * square)
     return jnp.stack([scale * u, scale * v]) - pixel
@@ -34,8 +35,10 @@ def projection(pose, lens, point, *, pixel):
 
 def as_residuals(problem: jaxba.BundleProblem) -> jaxba.BundleProblem:
     """The problem with all but one of its observations as rows of `projection`."""
-    rest, one = np.arange(1, problem.num_observations), np.arange(problem.num_observations) < 1
-    camera, point = problem.camera_index[rest], problem.point_index[rest]
+    rest = np.arange(1, problem.num_observations)
+    one = np.arange(problem.num_observations) < 1
+    camera = problem.camera_index[rest]
+    point = problem.point_index[rest]
     rows = projection(pose=camera, lens=camera, point=point, pixel=problem.observations[rest])
     return jaxba.with_residual(problem.subset(one), rows)
 

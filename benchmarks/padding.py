@@ -48,7 +48,10 @@ def solve_all(
 ) -> FirstSolves:
     """Solves every window once, starting without compiled programs."""
     programs: list[str] = []
-    listen = lambda event, duration_secs, **_: programs.append(event) if event == PROGRAM else None
+
+    def listen(event, duration_secs, **_):
+        return programs.append(event) if event == PROGRAM else None
+
     jax.clear_caches()
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:

@@ -113,9 +113,10 @@ def measure(
     damping = jnp.asarray(1e-4)
     yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
-    system_of = lambda la, li, s: schur.DampedSystem.of(
-        la, li, s.cameras, s.points, damping, plain
-    )[2:4]
+
+    def system_of(la, li, s):
+        return schur.DampedSystem.of(la, li, s.cameras, s.points, damping, plain)[2:4]
+
     yield phase(
         "eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping
     )
@@ -132,7 +133,10 @@ def measure(
     parts = linear, points, system, state
     if layout.grid is not None:
         yield phase("form", lambda *parts: formed.dense_system(whole(*parts)), *parts)
-        factor = lambda _, m, x: factor_and_solve(m, x.reshape(-1))
+
+        def factor(_, m, x):
+            return factor_and_solve(m, x.reshape(-1))
+
         yield phase("factor", factor, done["form"], system.right)
     elif plain.forms_reduced_system:
         yield phase("form", lambda *parts: formed.reduced_blocks(whole(*parts)), *parts)
@@ -145,7 +149,10 @@ def measure(
             "one product", lambda *parts: schur.apply_reduced(whole(*parts), parts[3].right), *parts
         )
     if plain.uses_camera_clusters:
-        coarse = lambda *parts: coarse_preconditioner(whole(*parts))(parts[3].right)
+
+        def coarse(*parts):
+            return coarse_preconditioner(whole(*parts))(parts[3].right)
+
         yield phase("coarse system", coarse, *parts)
     yield phase(
         "reduced solve", lambda *parts: reduced_system.solve_reduced(whole(*parts), plain), *parts
@@ -158,9 +165,12 @@ def measure(
     yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
     count = options.refinement.points
     if count:
-        refine = lambda la, s: refine_points(
-            la, s.cameras, slot_frames(la, s.cameras), s.points, plain.loss, count
-        )
+
+        def refine(la, s):
+            return refine_points(
+                la, s.cameras, slot_frames(la, s.cameras), s.points, plain.loss, count
+            )
+
         yield phase(f"refine {count}", refine, state)
         yield phase(
             "refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), state

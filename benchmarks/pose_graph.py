@@ -34,7 +34,8 @@ SIGMA = np.array([0.02] * 3 + [0.1] * 3)
 AXES = np.array([1.0, -1.0, -1.0])
 """From the axes of COLMAP to those of BAL."""
 
-ROUND, RADIUS = 50, 20.0
+ROUND = 50
+RADIUS = 20.0
 """Poses in a round, and the sphere's radius."""
 
 
@@ -42,7 +43,8 @@ class Graph:
     """Poses from body to world, and relative ones from the second body to the first."""
 
     def __init__(self, count: int) -> None:
-        random, turn = np.random.default_rng(0), np.arange(count)
+        random = np.random.default_rng(0)
+        turn = np.arange(count)
         height = np.linspace(-0.9, 0.9, count)
         around = 2 * np.pi * turn / ROUND
         ring = np.sqrt(1 - height**2)
@@ -57,7 +59,8 @@ class Graph:
         moved = np.einsum("nij,nj->ni", inverse, at[self.second] - at[self.first])
         self.turn = relative @ Rotation.from_rotvec(noise[:, :3]).as_matrix()
         self.move = moved + np.einsum("nij,nj->ni", relative, noise[:, 3:])
-        self.rotation, self.position = [rotation[0]], [at[0]]
+        self.rotation = [rotation[0]]
+        self.position = [at[0]]
         for k in range(count - 1):
             self.position.append(self.rotation[-1] @ self.move[k] + self.position[-1])
             self.rotation.append(self.rotation[-1] @ self.turn[k])
@@ -130,7 +133,8 @@ def inverse_of_right_jacobian(twist: Float[np.ndarray, "6"]) -> Float[np.ndarray
 def with_gtsam(graph: Graph, in_python: bool) -> tuple[float, float, str]:
     """As `with_jaxba`."""
     model = gtsam.noiseModel.Diagonal.Sigmas(SIGMA)
-    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors = gtsam.NonlinearFactorGraph()
+    values = gtsam.Values()
     poses = [
         gtsam.Pose3(gtsam.Rot3(r), p) for r, p in zip(graph.rotation, graph.position, strict=True)
     ]
@@ -199,7 +203,8 @@ def with_ceres(graph: Graph) -> tuple[float, float, str]:
     for cost, first, second in zip(costs, graph.first, graph.second, strict=True):
         problem.add_residual_block(cost, None, [poses[first], poses[second]])
     problem.set_parameter_block_constant(poses[0])
-    options, summary = pyceres.SolverOptions(), pyceres.SolverSummary()
+    options = pyceres.SolverOptions()
+    summary = pyceres.SolverSummary()
     options.linear_solver_type = pyceres.LinearSolverType.SPARSE_NORMAL_CHOLESKY
     options.function_tolerance = options.parameter_tolerance = options.gradient_tolerance = 1e-14
     options.max_num_iterations = 100

@@ -108,7 +108,8 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()
-    seen, judged = table(args.choose), table(args.judge)
+    seen = table(args.choose)
+    judged = table(args.judge)
     if args.out:
         np.savez(args.out, seen=seen, judged=judged)
     chosen = order(seen)

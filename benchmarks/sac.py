@@ -87,7 +87,10 @@ class Pendulum:
         moved = _Swing(angle + speed * 0.05, speed, state.clock + 1, state.key)
         ended = moved.clock >= LIMIT
         fresh, _ = self.reset(state.key)
-        choose = lambda new, old: jnp.where(ended, new, old)
+
+        def choose(new, old):
+            return jnp.where(ended, new, old)
+
         angle, speed, clock = map(choose, fresh[:3], moved[:3])
         after = _Swing(angle, speed, clock, fresh.key)
         metrics = {"length": moved.clock.astype(jnp.float32)}
@@ -135,12 +138,14 @@ class Sample(NamedTuple):
 def ours(config: SacConfig, envs: int, updates: int) -> Callable[[], Sample]:
     """A function that measures jaxba's loop with one update per vector step, after compilation and
     warm-up."""
-    env, loop = jax.device_put(Pendulum(envs)), LoopConfig(100_000, 1000, 1, updates)
+    env = jax.device_put(Pendulum(envs))
+    loop = LoopConfig(100_000, 1000, 1, updates)
     state, _ = run_chunk(config, loop, env, start(config, loop, env, jax.random.key(0)))
     held = [jax.block_until_ready(state)]
 
     def measure() -> Sample:
-        cpu, wall = time.process_time(), time.perf_counter()
+        cpu = time.process_time()
+        wall = time.perf_counter()
         held[0], _ = jax.block_until_ready(run_chunk(config, loop, env, held[0]))
         return Sample(updates, time.perf_counter() - wall, time.process_time() - cpu)
 

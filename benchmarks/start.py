@@ -55,14 +55,16 @@ PROBLEMS = (
 """Problems of 1,400 to 60,000 observations; of the sequence of 250 cameras only windows are
 solved."""
 
-WINDOW, LONGEST = 40, 100
+WINDOW = 40
+LONGEST = 100
 """Cameras of a window, and the number of cameras from which on a problem is a sequence of which
 windows are solved."""
 
 LEFT_OUT = 0.03
 """Share of the points that the other problem lacks."""
 
-COLD, WARM = (2.5, 4.0), (1.2, 2.0)
+COLD = (2.5, 4.0)
+WARM = (1.2, 2.0)
 """Targets: seconds, or times those of an empty program, whichever is more."""
 
 EMPTY = "import jax; jax.jit(lambda x: x)(1.0)"
@@ -76,7 +78,8 @@ PYCOLMAP = (
 def fewer_points(problem: BundleProblem) -> BundleProblem:
     """The problem without some points, chosen at random."""
     kept = np.random.default_rng(0).random(problem.num_points) >= LEFT_OUT
-    camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    camera = np.asarray(problem.camera_index)
+    point = np.asarray(problem.point_index)
     seen = kept[point]
     return problem.replace(
         points=problem.points[kept],
@@ -103,7 +106,8 @@ def two_problems(source: Path, folder: Path) -> tuple[Path, Path]:
         other.mkdir()
         model.write(str(other))
         return source, other
-    problem, first = read_problem(source), folder / "first.txt"
+    problem = read_problem(source)
+    first = folder / "first.txt"
     pair = (
         (problem, fewer_points(problem))
         if problem.num_cameras < LONGEST
@@ -223,7 +227,8 @@ def main() -> None:
     parser.add_argument("--python", help="a second interpreter, with another JAX")
     parser.add_argument("--out", help="output file of the metrics as JSON")
     args = parser.parse_args()
-    data, metrics = Path(os.environ.get("JAXBA_DATA", "")).resolve(), []
+    data = Path(os.environ.get("JAXBA_DATA", "")).resolve()
+    metrics = []
     for name in args.problem or PROBLEMS:
         if not (data / name).exists():
             parser.error(f"{name} is not below JAXBA_DATA")

@@ -171,7 +171,8 @@ def iteration_seconds(
     """
     import jaxba
 
-    times, solver = [], ""
+    times = []
+    solver = ""
     for _ in range(repeats):
         stamps = [0.0]
         solution = jaxba.solve(
@@ -306,9 +307,13 @@ def scene_throughput(repeats: int, scenes: int = 256) -> Iterator[Metric]:
     dense = dataclasses.replace(game, linear_solver="explicit")
     with jax.enable_x64(True):
         problems = [jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(scenes)]
-        stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+        def stack(trees):
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
         layouts = [jaxba.build_layout(problem) for problem in problems]
-        layout, damping = stack(layouts), jnp.full(scenes, 1e-3)
+        layout = stack(layouts)
+        damping = jnp.full(scenes, 1e-3)
         runs = {}
         for name, options in {
             "": jaxba.StepOptions(),
@@ -330,7 +335,8 @@ def scene_throughput(repeats: int, scenes: int = 256) -> Iterator[Metric]:
                 jax.block_until_ready(run())
                 times[name].append(time.perf_counter() - started)
     for name, taken in times.items():
-        speed, target = scenes / statistics.median(taken[1:]), None if name else 20_000
+        speed = scenes / statistics.median(taken[1:])
+        target = None if name else 20_000
         yield Metric(f"scenes/10 x 10 steps{name}", speed, "1/s", "higher", target=target)
 
 

@@ -82,13 +82,15 @@ def half_marks(survey: Survey, rng: Rng) -> Words:
 
 
 def typo(survey: Survey, rng: Rng) -> Words:
-    mark, axis = rng.integers(CONTROLS), rng.integers(3)
+    mark = rng.integers(CONTROLS)
+    axis = rng.integers(3)
     survey.marks[mark, axis] += rng.choice([-1, 1]) * rng.choice([1.0, 2.0, 5.0, 10.0, 20.0])
     return (rf"\b{survey.mark_names[mark]}\b",)
 
 
 def click(survey: Survey, rng: Rng) -> Words:
-    mark, view = rng.integers(CONTROLS), rng.integers(survey.mark_seen.shape[1])
+    mark = rng.integers(CONTROLS)
+    view = rng.integers(survey.mark_seen.shape[1])
     angle = rng.uniform(0, 2 * np.pi)
     survey.mark_pixels[mark, view] += rng.uniform(10, 60) * np.array([np.cos(angle), np.sin(angle)])
     return (rf"\b{survey.mark_names[mark]}\b",)
@@ -116,7 +118,8 @@ def degrees(survey: Survey, rng: Rng) -> Words:
 def heights(survey: Survey, rng: Rng) -> Words:
     shift = rng.choice([-1, 1]) * rng.uniform(20, 60)
     if not len(survey.marks):
-        first, count = rng.integers(len(survey.log) - 4), rng.integers(3, 5)
+        first = rng.integers(len(survey.log) - 4)
+        count = rng.integers(3, 5)
         survey.log[first : first + count, 2] += shift
         return tuple(rf"\b{name}\b" for name in survey.names[first : first + count])
     if not len(survey.log) or rng.random() < 0.3:
@@ -133,7 +136,8 @@ def no_fix(survey: Survey, rng: Rng) -> Words:
 
 
 def disparity(survey: Survey, rng: Rng) -> Words:
-    scale, shift = rng.uniform(1, 100), rng.choice([0.0, 0.2])
+    scale = rng.uniform(1, 100)
+    shift = rng.choice([0.0, 0.2])
     survey.maps = depth_maps(survey, survey.size, lambda depth: scale / depth + shift, rng)
     return DEPTHS
 
@@ -152,7 +156,8 @@ def outside(survey: Survey, rng: Rng) -> Words:
     if rng.random() < 0.5:
         survey.mark_pixels = survey.mark_pixels * 2
         return MARKS
-    mark, view = rng.integers(CONTROLS), rng.integers(survey.mark_seen.shape[1])
+    mark = rng.integers(CONTROLS)
+    view = rng.integers(survey.mark_seen.shape[1])
     survey.mark_pixels[mark, view, 0] += survey.size[0]  # a digit too much
     return (rf"\b{survey.mark_names[mark]}\b",)
 

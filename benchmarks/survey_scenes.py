@@ -21,10 +21,12 @@ from scipy.spatial.transform import Rotation
 import jaxba
 from jaxba.problem.similarity import Similarity, transformed
 
-VIEWS, MARK_VIEWS = 5, 4
+VIEWS = 5
+MARK_VIEWS = 4
 """Images that see each point, and each mark."""
 
-CONTROLS, CHECKS = 6, 3
+CONTROLS = 6
+CHECKS = 3
 """Marks of each kind."""
 
 
@@ -129,7 +131,8 @@ def draw(shape: str, content: str, seed: int) -> Survey:
     prefix = str(rng.choice(PREFIXES))
     first = int(rng.integers(1, 800))
     local = shape in ("facade", "room") and "log" not in content
-    longitude, latitude = rng.uniform(-120, 150), rng.uniform(25, 60) * rng.choice([-1, 1])
+    longitude = rng.uniform(-120, 150)
+    latitude = rng.uniform(25, 60) * rng.choice([-1, 1])
     zone = int((longitude + 180) // 6) + 1
     survey = Survey(
         shape=shape,
@@ -442,7 +445,8 @@ def _write_model(survey: Survey, folder: Path) -> None:
     (folder / "cameras.txt").write_text(
         f"1 {kind} {survey.size[0]} {survey.size[1]} {parameters}\n"
     )
-    lines, tracks = [], [[] for _ in survey.points]
+    lines = []
+    tracks = [[] for _ in survey.points]
     for image, name in enumerate(survey.names):
         x, y, z, w = Rotation.from_matrix(survey.turns[image]).as_quat().tolist()
         shift = (-survey.turns[image] @ survey.centres[image]).tolist()

@@ -77,7 +77,8 @@ def score(env: PresetGame, policy: Any) -> float:
 
 def ours(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
     """jaxba's compiled loop."""
-    config, run = env.preset, Run()
+    config = env.preset
+    run = Run()
     loop = dataclasses.replace(config.loop, steps_per_chunk=EVERY)
     with numerics("float64"):
         state = start(config.sac, loop, env, jax.random.key(1))
@@ -102,7 +103,8 @@ def peer(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
     from examples.gym_sbx import ForStableBaselines
     from jaxba.game.gym import GymVectorGame
 
-    loop, run = env.preset.loop, Run()
+    loop = env.preset.loop
+    run = Run()
     model = SAC(
         "MlpPolicy",
         ForStableBaselines(GymVectorGame(env, "SameStep")),
@@ -116,7 +118,9 @@ def peer(env: PresetGame, limit: float, target: float) -> Iterator[Run]:
     )
     model.learn(loop.warmup_steps + EVERY * env.num_envs)  # compiles; not counted as time
     while run.seconds < limit and not run.reached > 0:
-        steps, updates, began = model.num_timesteps, model._n_updates, time.perf_counter()
+        steps = model.num_timesteps
+        updates = model._n_updates
+        began = time.perf_counter()
         model.learn(EVERY * env.num_envs, reset_num_timesteps=False)
         jax.block_until_ready(model.policy.actor_state.params)
         run.seconds += time.perf_counter() - began
@@ -160,7 +164,8 @@ def main() -> None:
         f"held-out scenes: Ceres' rule takes {rule:.2f} iterations, to reach {TARGET * rule:.2f}",
         flush=True,
     )
-    metrics, done = [], {}
+    metrics = []
+    done = {}
     for name, trainer in (("jaxba", ours), ("sbx", peer)):
         for run in trainer(env, args.limit, TARGET * rule):
             print(

@@ -44,7 +44,11 @@ SCALES = {
 """Candidates for the twin's loss, pixels."""
 FACTORS = (1.0, 1.5, 2.5)
 """Candidates for the scale of Cauchy's loss over the sigma of the residuals."""
-TRAIN, TEST, WIDTH, SHARE, PARTS = range(20, 120, 20), range(120, 200, 20), 20, 8, 2
+TRAIN = range(20, 120, 20)
+TEST = range(120, 200, 20)
+WIDTH = 20
+SHARE = 8
+PARTS = 2
 """First frames of windows, their length, into how many parts tracks are divided, and how many of
 these train. True poses of the first frames of sequence 00 are wrong by decimetres."""
 STRICT = jaxba.Tolerances(ftol=1e-12, gtol=0.0, xtol=1e-12)
@@ -79,7 +83,8 @@ def error(cameras: np.ndarray, truth: np.ndarray) -> float:
 
 def ends(cases: list[Case], model: np.ndarray, loss: str = "cauchy") -> np.ndarray:
     """Errors of the solves with a model, by the truth and by the other tracks, shape (2, cases)."""
-    options, found = replace(SOLVE, loss=jaxba.Loss(loss)), []
+    options = replace(SOLVE, loss=jaxba.Loss(loss))
+    found = []
     for case in cases:
         cameras = np.asarray(jaxba.solve(whitened(case, model), options=options).problem.cameras)
         found.append(
@@ -127,7 +132,8 @@ def by_residuals(train: list[Case]) -> np.ndarray:
         log_sigma = model[0] + features @ model[1:]
         # Student's distribution with two degrees of freedom
         share = squares * np.exp(-2 * log_sigma) / 2
-        slope, value = 2 - 4 * share / (1 + share), 2 * log_sigma + 2 * np.log1p(share)
+        slope = 2 - 4 * share / (1 + share)
+        value = 2 * log_sigma + 2 * np.log1p(share)
         return value.mean(), np.append(slope.mean(), slope @ features / len(slope))
 
     found = minimize(likelihood, np.zeros(1 + features.shape[1]), jac=True).x
@@ -166,7 +172,8 @@ def through_solve(
 ) -> np.ndarray:
     """Adam on the mean of `gradient`; `draw` makes the problem of a step from a case."""
     # a number can move by 1, however many steps there are
-    rule, model = optax.adam(optax.cosine_decay_schedule(2 / steps, steps)), jnp.asarray(start)
+    rule = optax.adam(optax.cosine_decay_schedule(2 / steps, steps))
+    model = jnp.asarray(start)
     state = rule.init(model)
     for _ in range(steps):
         slope = np.mean([gradient(draw(case), np.asarray(model)) for case in cases], axis=0)
@@ -188,7 +195,8 @@ def report(test: list[Case], base: np.ndarray, name: str, model: np.ndarray) -> 
 def scenes(steps: int = 40) -> None:
     """Random scenes whose noise depends on two of three features; `known noise` has the true
     numbers."""
-    known, rng = np.array([np.log(0.4), 0.7, -0.4, 0.0]), np.random.default_rng(0)
+    known = np.array([np.log(0.4), 0.7, -0.4, 0.0])
+    rng = np.random.default_rng(0)
 
     def draw(truth: BundleProblem) -> Case:
         features = rng.normal(size=(truth.num_observations, 3))
@@ -222,14 +230,14 @@ def features_of(
     from jaxba.kitti.opencv import cv2
     from jaxba.kitti.sequence import read_sequence
 
-    sequence, numbers = read_sequence(folder), np.zeros((problem.num_observations, 3))
-    read, center = image_reader(sequence), [sequence.calibration.cx, sequence.calibration.cy]
+    sequence = read_sequence(folder)
+    numbers = np.zeros((problem.num_observations, 3))
+    read = image_reader(sequence)
+    center = [sequence.calibration.cx, sequence.calibration.cy]
     pixels = np.asarray(problem.observations) * [1, -1]
     for camera, frame in enumerate(frames):
-        image, rows = (
-            read(sequence.numbers.index(frame)),
-            np.flatnonzero(problem.camera_index == camera),
-        )
+        image = read(sequence.numbers.index(frame))
+        rows = np.flatnonzero(problem.camera_index == camera)
         found = cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST).detect(image, None)
         far, at = (
             np.asarray(x) for x in KDTree([key.pt for key in found]).query(pixels[rows] + center)
@@ -244,15 +252,17 @@ def features_of(
             [[key.size for key in keys], [key.response for key in keys], corner[y, x]], axis=1
         )
     size, response, contrast = np.log(numbers + np.array([0, 0, 1e-6])).T
-    point, camera = np.asarray(problem.point_index), np.asarray(problem.camera_index)
+    point = np.asarray(problem.point_index)
+    camera = np.asarray(problem.camera_index)
     order = np.lexsort((camera, point))
-    inverse, starts = (
-        np.argsort(order),
-        np.searchsorted(point[order], np.arange(problem.num_points)),
-    )
+    inverse = np.argsort(order)
+    starts = np.searchsorted(point[order], np.arange(problem.num_points))
     length = np.bincount(point)[point]
     age = inverse - starts[point]
-    own = lambda x: np.abs(x - (np.bincount(point, x) / np.bincount(point))[point])
+
+    def own(x):
+        return np.abs(x - (np.bincount(point, x) / np.bincount(point))[point])
+
     step = np.linalg.norm(np.diff(pixels[order], axis=0, prepend=pixels[order][:1]), axis=1)
     step[starts] = step[starts + 1]
     found = {
@@ -275,16 +285,16 @@ def features_of(
 
 def kitti(path: str, folder: str, poses: str, steps: int = 12) -> None:
     """Windows of a sequence: training on the first frames, ratios on the last."""
-    problem, side = read_problem(path), read_sidecar(path)
-    frames, truth = (
-        np.asarray(side.frames),
-        poses_of(read_poses(poses), side.frames, side.calibration)[:, :, 3],
-    )
+    problem = read_problem(path)
+    side = read_sidecar(path)
+    frames = np.asarray(side.frames)
+    truth = poses_of(read_poses(poses), side.frames, side.calibration)[:, :, 3]
     kept = Path(f"{path}.features.npz")
     if not kept.exists():
         np.savez(kept, allow_pickle=False, **features_of(problem, side.frames, folder))
     columns = dict(np.load(kept))
-    table, number = np.stack([*columns.values()], axis=1), frames[problem.camera_index]
+    table = np.stack([*columns.values()], axis=1)
+    number = frames[problem.camera_index]
     learned = table[(number >= TRAIN.start) & (number < TRAIN.stop)]
     table = (table - learned.mean(axis=0)) / learned.std(axis=0)
     part_of = np.random.default_rng(0).integers(SHARE, size=problem.num_points)
@@ -301,10 +311,11 @@ def kitti(path: str, folder: str, poses: str, steps: int = 12) -> None:
         own = problem.subset(rows, cameras, np.unique(problem.point_index[rows]))
         return Case(own, table[rows], truth[cameras])
 
-    cut = lambda starts, count: [
-        window(first, range(k, k + 1)) for first in starts for k in range(count)
-    ]
-    train, test = cut(TRAIN, PARTS), cut(TEST, SHARE)
+    def cut(starts, count):
+        return [window(first, range(k, k + 1)) for first in starts for k in range(count)]
+
+    train = cut(TRAIN, PARTS)
+    test = cut(TEST, SHARE)
     twin, start = choose_twin(train, train + test)
     half = SHARE // 2
     for at, first in enumerate(TEST):
@@ -314,7 +325,8 @@ def kitti(path: str, folder: str, poses: str, steps: int = 12) -> None:
         )
         for case in test[at * SHARE : at * SHARE + half]:
             case.others = geometry.camera_centers(np.asarray(found.problem.cameras))
-    base, residuals = ends(test, equal(test[0], twin[1]), twin[0]), by_residuals(train)
+    base = ends(test, equal(test[0], twin[1]), twin[0])
+    residuals = by_residuals(train)
     print(
         f"{len(test)} held-out problems; twin", twin, geometric_mean(base[0]), *columns, flush=True
     )

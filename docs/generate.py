@@ -64,7 +64,8 @@ def table(path: str, *, command: bool) -> str:
         raise DocumentError(f"{path}: no fields")
     rows = [f"| {'option' if command else 'field'} | default | meaning |", "| --- | --- | --- |"]
     for field in fields:
-        annotation, default = str(field.annotation), _value(found, field.value)
+        annotation = str(field.annotation)
+        default = _value(found, field.value)
         name = f"`{_option(field.name, annotation)}`" if command else f"`{field.name}`"
         choices = ", ".join(f"`{choice}`" for choice in _choices(found, annotation))
         words = " ".join(field.docstring.value.split()) if field.docstring else ""

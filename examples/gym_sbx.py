@@ -83,7 +83,9 @@ class Watch(BaseCallback):
 
     def __init__(self, seconds: float) -> None:
         super().__init__()
-        self.seconds, self.lengths, self.rule = seconds, [], []
+        self.seconds = seconds
+        self.lengths = []
+        self.rule = []
 
     def _on_training_start(self) -> None:
         self.end = time.perf_counter() + self.seconds

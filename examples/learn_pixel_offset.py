@@ -19,7 +19,8 @@ import jaxba
 OFFSET = 3.0
 """The true offset, pixels."""
 
-RATE, STEPS = 0.3, 60
+RATE = 0.3
+STEPS = 60
 """Of Adam."""
 
 

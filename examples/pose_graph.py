@@ -31,7 +31,8 @@ def read(text: str) -> tuple[list[str], jaxba.BundleProblem]:
         words[1]: np.array(words[2:9], float) for words in lines if words[:1] == ["VERTEX_SE3:QUAT"]
     }
     edges = [words[1:] for words in lines if words[:1] == ["EDGE_SE3:QUAT"]]
-    names, place = list(vertices), {name: k for k, name in enumerate(vertices)}
+    names = list(vertices)
+    place = {name: k for k, name in enumerate(vertices)}
     poses = np.array(list(vertices.values()))
     turn = AXES[:, None] * Rotation.from_quat(poses[:, 3:]).inv().as_matrix()
     move = -np.einsum("nij,nj->ni", turn, poses[:, :3])

@@ -34,7 +34,9 @@ def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
 def _skew_polynomial(vector: Array, linear: Array, quadratic: Array) -> Float[Array, "3 3 n"]:
     """`I + linear [w]x + quadratic [w]x^2` for vectors [3, n]."""
     x, y, z = vector
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     one = jnp.ones_like(x)
     q = quadratic
     rows = [
@@ -76,7 +78,8 @@ def compose_left(step: Float[Array, "3 n"], angle_axis: Float[Array, "3 n"]) -> 
     real = a * b - jnp.sum(u * v, axis=0)
     imaginary = a * v + b * u + jnp.cross(u, v, axis=0)
     sign = jnp.where(real < 0, -1.0, 1.0).astype(real.dtype)
-    real, imaginary = real * sign, imaginary * sign
+    real = real * sign
+    imaginary = imaginary * sign
     squared = jnp.sum(imaginary * imaginary, axis=0)
     small = squared < SMALL_ANGLE_SQUARED
     norm = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), squared))
@@ -104,7 +107,10 @@ def angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     squares = jnp.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
     antisymmetric = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
-    symmetric = lambda i, j: m[:, i, j] + m[:, j, i]
+
+    def symmetric(i, j):
+        return m[:, i, j] + m[:, j, i]
+
     x, y, z = antisymmetric
     two = 2 * squares[:, 1:] - trace[:, None]
     rows = jnp.stack(

@@ -52,7 +52,8 @@ def same(one: Any, other: Any) -> bool:
     """Whether two values are equal: arrays if their shapes and all entries are, and tuples if all
     items are."""
     if isinstance(one, AnyArray) or isinstance(other, AnyArray):
-        one, other = np.asarray(one), np.asarray(other)
+        one = np.asarray(one)
+        other = np.asarray(other)
         return one.shape == other.shape and bool(
             np.all((one == other) | ((one != one) & (other != other)))
         )

@@ -33,7 +33,8 @@ FLAGS = (
 def chromium(*flags: str) -> Iterator[Any]:
     """A driver of a new browser; the test is skipped where there is none."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    browser = shutil.which("chromium")
+    driver = shutil.which("chromedriver")
     if browser is None or driver is None:
         pytest.skip("needs Debian's packages chromium and chromium-driver")
     options = webdriver.ChromeOptions()

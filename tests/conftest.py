@@ -140,7 +140,8 @@ def few_programs():
     a module they stay, as far as they may, so that its tests can count them."""
     from jaxba.runtime import process  # here, so that the import hook of jaxtyping sees it
 
-    share, process.MAPPINGS_SHARE = process.MAPPINGS_SHARE, 0.8
+    share = process.MAPPINGS_SHARE
+    process.MAPPINGS_SHARE = 0.8
     yield
     process.MAPPINGS_SHARE = share
     process.release_programs(0.2)
@@ -152,7 +153,8 @@ def memory_is_given_back():
     gigabytes."""
     from jaxba.runtime import process
 
-    keep, process.keep_memory = process.keep_memory, lambda: False
+    keep = process.keep_memory
+    process.keep_memory = lambda: False
     yield
     process.keep_memory = keep
 

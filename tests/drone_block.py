@@ -16,11 +16,15 @@ from jaxba.problem.similarity import Similarity, transformed
 ORIGIN = (8.5, 47.3, 500.0)
 """Longitude, latitude and height of the origin."""
 
-HEIGHT, STRIPS, PER_STRIP, POINTS = 100.0, 6, 10, 800
+HEIGHT = 100.0
+STRIPS = 6
+PER_STRIP = 10
+POINTS = 800
 LENS = (1000.0, -0.05, 0.0)  # f (pixels), k1, k2
 RTK, SURVEYED, CLICKED = 0.02, 0.01, 0.5  # standard deviations: metres, metres, pixels
 SIZE = np.array([1000, 750])  # pixels
-CONTROLS, CHECKS = 5, 20
+CONTROLS = 5
+CHECKS = 20
 """Marks of each kind; the first ones are control points."""
 
 
@@ -74,7 +78,8 @@ def drone_block(folder: Path, seed: int = 0) -> Block:
     )
     pixels = geometry.project(every)
     inside = (np.abs(pixels) < SIZE / 2).all(axis=1)
-    tie, mark = inside & (pairs[:, 1] < POINTS), inside & (pairs[:, 1] >= POINTS)
+    tie = inside & (pairs[:, 1] < POINTS)
+    mark = inside & (pairs[:, 1] >= POINTS)
     noisy = pixels + rng.normal(0, np.where(tie, 1.0, CLICKED)[:, None], pixels.shape)
     truth = jaxba.BundleProblem.create(cameras, places, noisy[tie], *pairs[tie].T, lenses=lenses)
     moved = turns + rng.normal(0, 0.003, turns.shape), centers + rng.normal(0, 0.3, centers.shape)
@@ -96,7 +101,8 @@ def drone_block(folder: Path, seed: int = 0) -> Block:
     )
     measured = marks + rng.normal(0, SURVEYED, marks.shape)
     measured[CONTROLS:] = marks[CONTROLS:]
-    grid, lines = on_earth(measured, "EPSG:32632").tolist(), ["WGS84 UTM 32N"]
+    grid = on_earth(measured, "EPSG:32632").tolist()
+    lines = ["WGS84 UTM 32N"]
     for (image, at), (x, y) in zip(pairs[mark].tolist(), noisy[mark].tolist(), strict=True):
         east, north, up = grid[at - POINTS]
         lines.append(

@@ -64,7 +64,8 @@ def render(camera: Camera, pose: np.ndarray, layers: list[np.ndarray]) -> np.nda
     v = (np.arange(camera.height)[:, None] + half).ravel()
     x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ pose[:, :3].T
-    nearest, grey = np.full(x.shape, np.inf), np.zeros(x.shape)
+    nearest = np.full(x.shape, np.inf)
+    grey = np.zeros(x.shape)
     for (axis, position, (a, b)), layer in zip(PLANES, layers, strict=True):
         with np.errstate(divide="ignore"):
             distance = (position - pose[axis, 3]) / rays[..., axis]

@@ -29,7 +29,8 @@ LOSSES = Loss(), Loss(), Loss("huber", 1.0), Loss("soft_l1", 2.0), Loss("cauchy"
 
 def draw(kind: int, seed: int = 0) -> tuple[BundleProblem, Loss]:
     """A problem and a loss. Those of one kind have the same structure, and so share programs."""
-    structure, values = np.random.default_rng([kind, 17]), np.random.default_rng([kind, seed])
+    structure = np.random.default_rng([kind, 17])
+    values = np.random.default_rng([kind, seed])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProblemWarning)
         problem = _scene(structure, values)
@@ -44,16 +45,19 @@ def draw(kind: int, seed: int = 0) -> tuple[BundleProblem, Loss]:
 def _scene(structure: np.random.Generator, values: np.random.Generator) -> BundleProblem:
     """5 to 20 cameras around points, in rigs of up to three sensors, with up to three lenses or one
     each."""
-    sensors, points = int(structure.integers(1, 4)), int(structure.integers(30, 90))
+    sensors = int(structure.integers(1, 4))
+    points = int(structure.integers(30, 90))
     frames = int(structure.integers(-(-5 // sensors), 20 // sensors + 1))
-    cameras, free = sensors * frames, bool(structure.integers(2))
+    cameras = sensors * frames
+    free = bool(structure.integers(2))
     frame, sensor = np.divmod(np.arange(cameras), sensors)
     lens = sensor if sensors > 1 else np.arange(cameras) % int(structure.choice([1, 2, cameras]))
     angle = 2 * np.pi * np.arange(frames) / frames * structure.choice([0.3, 1.0])
     upright = np.outer(-angle, [0, 1, 0]) + 0.05 * values.normal(size=(frames, 3))
     # of the points, in each frame
     middle = np.array([0, 0, -6.0]) + 0.3 * values.normal(size=(frames, 3))
-    turn, offset = 0.15 * values.normal(size=(sensors, 3)), 0.3 * values.normal(size=(sensors, 3))
+    turn = 0.15 * values.normal(size=(sensors, 3))
+    offset = 0.3 * values.normal(size=(sensors, 3))
     turn[0] = offset[0] = 0
     positions = values.uniform(-1.5, 1.5, size=(points, 3))
     intrinsics = np.array([700.0, -0.05, 0.0]) * (1 + 0.1 * values.normal(size=(lens.max() + 1, 3)))
@@ -72,7 +76,10 @@ def _scene(structure: np.random.Generator, values: np.random.Generator) -> Bundl
     truth = BundleProblem.create(placed(upright, middle, turn, offset, intrinsics)[0], positions,
                                  np.zeros((len(camera), 2)), camera, point)  # fmt: skip
     pixels = geometry.project(truth) + 0.5 * values.normal(size=(len(camera), 2))
-    moved = lambda x, by: x + by * values.normal(size=x.shape)
+
+    def moved(x, by):
+        return x + by * values.normal(size=x.shape)
+
     if sensors > 1 and free:
         turn[1:], offset[1:] = moved(turn[1:], 0.01), moved(offset[1:], 0.02)
     start = moved(upright, 0.01), moved(middle, 0.05)
@@ -89,8 +96,12 @@ def _measured(
     problem: BundleProblem, structure: np.random.Generator, values: np.random.Generator
 ) -> BundleProblem:
     """With priors of any strength, and perhaps surveyed points or a scale bar."""
-    spread = lambda low, high: float(np.exp(values.uniform(np.log(low), np.log(high))))
-    wanted, count = structure.random(5) < [0.7, 0.3, 0.3, 0.3, 0.2], problem.num_cameras
+
+    def spread(low, high):
+        return float(np.exp(values.uniform(np.log(low), np.log(high))))
+
+    wanted = structure.random(5) < [0.7, 0.3, 0.3, 0.3, 0.2]
+    count = problem.num_cameras
     if wanted[0]:
         sigma = spread(1e-3, 1.0)
         centers = geometry.camera_centers(problem.cameras) + sigma * values.normal(size=(count, 3))
@@ -104,7 +115,8 @@ def _measured(
     if wanted[2]:
         problem = with_lens_priors(problem, {"focal": spread(0.1, 100.0), "k1": spread(1e-3, 0.1)})
     if wanted[3]:
-        sigma, at = spread(1e-3, 0.3), structure.permutation(problem.num_points)[:5]
+        sigma = spread(1e-3, 0.3)
+        at = structure.permutation(problem.num_points)[:5]
         surveyed = problem.points[at] + sigma * values.normal(size=(5, 3))
         rows = residuals.control_point(
             point=at, position=surveyed, whitening=np.tile(np.eye(3) / sigma, (5, 1, 1))

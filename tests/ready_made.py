@@ -13,7 +13,8 @@ from jaxba.problem.residuals import Rows
 from jaxba.problem.similarity import Similarity, transformed
 from jaxba.scenes import SceneConfig
 
-CAMERAS, POINTS = 5, 30
+CAMERAS = 5
+POINTS = 30
 
 EACH = np.arange(CAMERAS - 1)  # images and points that have rows
 
@@ -104,7 +105,8 @@ def _imu(problem: jaxba.BundleProblem) -> tuple[Rows, dict[str, Any]]:
 
 def _lens_bounds(problem: jaxba.BundleProblem) -> tuple[Rows, dict[str, Any]]:
     lens = problem.cameras[:, 6:]
-    low, high = lens.min(axis=0) - 1.0, lens.max(axis=0) + 1.0
+    low = lens.min(axis=0) - 1.0
+    high = lens.max(axis=0) + 1.0
     return residuals.lens_bounds(lens=EACH, low=low, high=high, sigma=0.5), {}
 
 
@@ -137,7 +139,8 @@ def relative_poses(problem: jaxba.BundleProblem) -> tuple[np.ndarray, np.ndarray
 
 
 def _rolling_shutter(problem: jaxba.BundleProblem) -> tuple[Rows, dict[str, Any]]:
-    camera, point = problem.camera_index, problem.point_index
+    camera = problem.camera_index
+    point = problem.point_index
     time = np.linspace(-0.4, 0.4, len(camera))
     index = {"pose": camera, "lens": camera, "point": point, "velocity": camera}
     rows = residuals.rolling_shutter(**index, pixel=problem.observations, time=time, sigma=1.0)

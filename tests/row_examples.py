@@ -16,7 +16,8 @@ from jaxba import BundleProblem, Loss, residuals
 from jaxba.problem import geometry
 from jaxba.problem.residuals import Residual, Residuals, Rows
 
-CAMERAS, POINTS = 5, 12
+CAMERAS = 5
+POINTS = 12
 
 READY_MADE = [name for name in residuals.__all__ if isinstance(getattr(residuals, name), Residual)]
 """Names of the residuals of the package."""
@@ -59,7 +60,8 @@ def rotations(problem: BundleProblem) -> np.ndarray:
 def views(problem: BundleProblem, rng: np.random.Generator) -> np.ndarray:
     """Nine observations, of nine points and as many of each camera whatever is drawn: shapes stay
     the same."""
-    cameras, points = rng.permutation(CAMERAS)[np.arange(9) % CAMERAS], rng.permutation(POINTS)[:9]
+    cameras = rng.permutation(CAMERAS)[np.arange(9) % CAMERAS]
+    points = rng.permutation(POINTS)[:9]
     wanted = cameras * POINTS + points
     order = np.argsort(problem.camera_index * POINTS + problem.point_index)
     return order[wanted]
@@ -109,18 +111,17 @@ def baseline(problem: BundleProblem, rng: np.random.Generator) -> Example:
 
 def gravity(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """Plumb lines of three images."""
-    cameras, up = rng.permutation(CAMERAS)[:3], rng.standard_normal(3)
+    cameras = rng.permutation(CAMERAS)[:3]
+    up = rng.standard_normal(3)
     direction = near(rng, rotations(problem)[cameras] @ up, 0.05)
     return Example(residuals.gravity(pose=cameras, direction=direction, up=up[None], sigma=0.02), 3)
 
 
 def heading(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """Azimuths of three images."""
-    cameras, up, north = (
-        rng.permutation(CAMERAS)[:3],
-        rng.standard_normal(3),
-        rng.standard_normal(3),
-    )
+    cameras = rng.permutation(CAMERAS)[:3]
+    up = rng.standard_normal(3)
+    north = rng.standard_normal(3)
     azimuth = rng.uniform(-3, 3, 3)
     rows = residuals.heading(
         pose=cameras, azimuth=azimuth, north=north[None], up=up[None], sigma=3.0
@@ -142,7 +143,8 @@ def position(problem: BundleProblem, rng: np.random.Generator) -> Example:
 def depth(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """A depth map with a scale of its own in each image."""
     seen = views(problem, rng)
-    camera, point = problem.camera_index[seen], problem.point_index[seen]
+    camera = problem.camera_index[seen]
+    point = problem.point_index[seen]
     measured = near(rng, geometry.depths(problem)[seen], 0.2)
     rows = residuals.depth(pose=camera, point=point, image=camera, measured=measured, sigma=0.2)
     return Example(rows, 1, {"image": np.tile([1.0, 0.0], (CAMERAS, 1))})
@@ -151,7 +153,8 @@ def depth(problem: BundleProblem, rng: np.random.Generator) -> Example:
 def rolling_shutter(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """Pixels that were taken later than their images."""
     seen = views(problem, rng)
-    camera, point = problem.camera_index[seen], problem.point_index[seen]
+    camera = problem.camera_index[seen]
+    point = problem.point_index[seen]
     rows = residuals.rolling_shutter(
         pose=camera,
         lens=camera,
@@ -196,14 +199,13 @@ def relative_pose(problem: BundleProblem, rng: np.random.Generator) -> Example:
 def imu(problem: BundleProblem, rng: np.random.Generator) -> Example:
     """An inertial chain through all images, of any motion."""
     times = np.linspace(0.0, 2.0, 21)
-    rates, forces = (
-        0.1 * rng.standard_normal((21, 3)),
-        near(rng, np.tile([0.0, 0.0, 9.81], (21, 1)), 1.0),
-    )
+    rates = 0.1 * rng.standard_normal((21, 3))
+    forces = near(rng, np.tile([0.0, 0.0, 9.81], (21, 1)), 1.0)
     moments = np.linspace(0.0, 2.0, CAMERAS)
     data = residuals.preintegrated(times, rates, forces, moments, noise=[0.1, 0.5, 0.1, 0.1])
     mount = np.hstack([np.eye(3), 0.1 * rng.standard_normal((3, 1))])
-    one, other = np.arange(CAMERAS - 1), np.arange(1, CAMERAS)
+    one = np.arange(CAMERAS - 1)
+    other = np.arange(1, CAMERAS)
     gravity = np.array([[0.0, 0.0, -9.81]])
     rows = residuals.imu(
         pose=one,
@@ -263,7 +265,9 @@ def with_rows_of(problem: BundleProblem, names: list[str], seed: int) -> BundleP
         problem: a `scene`.
         names: of `READY_MADE`, or `OWN`.
         seed: of what was measured."""
-    rng, rows, unknowns = np.random.default_rng(seed), [], {}
+    rng = np.random.default_rng(seed)
+    rows = []
+    unknowns = {}
     for name in names:
         made = MAKERS[name](problem, rng)
         index = tuple(x.astype(np.int32) for x in made.rows.index)

@@ -56,7 +56,10 @@ def constrained(problem: BundleProblem, *options: Any, **more: Any) -> BundlePro
 
 def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, iteration=0):
     """`lm_step`, compiled. Called as `solve` does, so that the compilation cache serves both."""
-    number = lambda x: jnp.asarray(x, state.cost.dtype)
+
+    def number(x):
+        return jnp.asarray(x, state.cost.dtype)
+
     return _step(
         layout, state, number(damping), options, number(min_gain), jnp.asarray(iteration, jnp.int32)
     )
@@ -191,7 +194,8 @@ def solved() -> BundleProblem:
 
 def strayed(factor: float, every: int = 5) -> BundleProblem:
     """Every fifth point at a multiple of its distance from the first camera that sees it."""
-    problem, points = solved(), np.array(solved().points)
+    problem = solved()
+    points = np.array(solved().points)
     centers = geometry.camera_centers(problem.cameras)
     for point in range(0, len(points), every):
         center = centers[problem.camera_index[np.argmax(problem.point_index == point)]]
@@ -238,7 +242,10 @@ def step_info(
     accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp.float64, **changes
 ) -> StepInfo:
     """A record for a damping rule to look at."""
-    number = lambda x: jnp.asarray(x, dtype)
+
+    def number(x):
+        return jnp.asarray(x, dtype)
+
     values = {
         "cost": 1.0,
         "previous_cost": 2.0,
@@ -308,7 +315,8 @@ def distort(plane: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 def published_loss(name: str, scale: float, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Value and derivative as Ceres defines them."""
-    a, b = scale, scale**2
+    a = scale
+    b = scale**2
     s = np.asarray(s, np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         if name == "squared":
@@ -373,7 +381,8 @@ def _residual(problem: BundleProblem):
         jnp.asarray(problem.cameras)[problem.camera_index],
         jnp.asarray(problem.points)[problem.point_index],
     )
-    residual, jacobian = np.asarray(pixel) - problem.observations, [np.array(j) for j in jacobian]
+    residual = np.asarray(pixel) - problem.observations
+    jacobian = [np.array(j) for j in jacobian]
     if problem.whitening is not None:
         residual = np.einsum("nij,nj->ni", problem.whitening, residual)
         jacobian = [np.einsum("nij,njk->nik", problem.whitening, j) for j in jacobian]
@@ -389,7 +398,8 @@ def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np
     weight = np.sqrt(
         published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[1]
     )
-    count, cameras = problem.num_observations, problem.num_cameras
+    count = problem.num_observations
+    cameras = problem.num_cameras
     if options.intrinsics == "fixed":
         camera[:, :, 6:] = 0
     jacobian = np.zeros((count, 2, 9 * cameras + 3 * problem.num_points))
@@ -497,7 +507,8 @@ def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     assert truth.norm(found - truth.step) <= 1e-8 * truth.norm(truth.step)
     if well_conditioned:
         size = problem.cameras.size
-        cameras, expected = found[:size].reshape(-1, 9), truth.step[:size].reshape(-1, 9)
+        cameras = found[:size].reshape(-1, 9)
+        expected = truth.step[:size].reshape(-1, 9)
         for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
             assert np.linalg.norm((cameras - expected)[:, part]) <= 1e-8 * np.linalg.norm(
                 expected[:, part]

@@ -122,7 +122,8 @@ def test_the_commands_of_a_page_have_the_options_that_it_names(page):
         module = importlib.import_module(f"jaxba.cli.{match[1]}")
         arguments = module.Arguments
         if match[1] == "kitti" and words[0] == module.EVALUATE:
-            arguments, words = module.EvaluateArguments, words[1:]
+            arguments = module.EvaluateArguments
+            words = words[1:]
         try:
             parsed = tyro.cli(arguments, args=words)
         except SystemExit:

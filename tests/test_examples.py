@@ -26,12 +26,17 @@ def test_the_notebook_learns_weights_that_bring_held_out_points_nearer_to_the_tr
 
 @pytest.mark.slow
 def test_a_graph_of_exact_relative_poses_is_solved_and_written(tmp_path):
-    random, count = np.random.default_rng(0), 6
-    turns, places = Rotation.random(count, rng=0), random.standard_normal((count, 3))
+    random = np.random.default_rng(0)
+    count = 6
+    turns = Rotation.random(count, rng=0)
+    places = random.standard_normal((count, 3))
     start = places + np.where(np.arange(count) > 0, 0.2, 0.0)[:, None] * random.standard_normal(
         (count, 3)
     )
-    numbers = lambda *parts: " ".join(f"{x:.17g}" for part in parts for x in part)
+
+    def numbers(*parts):
+        return " ".join(f"{x:.17g}" for part in parts for x in part)
+
     lines = [
         f"VERTEX_SE3:QUAT {10 * k} {numbers(start[k], turns[k].as_quat())}" for k in range(count)
     ]

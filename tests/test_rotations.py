@@ -28,6 +28,9 @@ def test_angle_axis_vectors_are_those_of_scipy(angle):
 
 def test_the_logarithm_has_derivatives_at_no_rotation():
     """Backwards, too: relative poses that fit exactly have none of it."""
-    of = lambda w: angle_axis(rotation_matrix(w[:, None])[..., 0][None])[0]
+
+    def of(w):
+        return angle_axis(rotation_matrix(w[:, None])[..., 0][None])[0]
+
     for differentiate in (jax.jacrev, jax.jacfwd):
         np.testing.assert_allclose(differentiate(of)(jnp.zeros(3)), np.eye(3), atol=1e-12)

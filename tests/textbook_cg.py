@@ -19,17 +19,20 @@ def right(seed: int = 1) -> np.ndarray:
 
 def by_hand(matrix, b, inverse, count: int) -> list[np.ndarray]:
     """Iterates of textbook preconditioned conjugate gradients in NumPy."""
-    x, r = np.zeros(b.size), b.reshape(-1).copy()
+    x = np.zeros(b.size)
+    r = b.reshape(-1).copy()
     p = z = inverse @ r
     found = []
     for _ in range(count):
         q = matrix @ p
         alpha = (r @ z) / (p @ q)
-        x, after = x + alpha * p, r - alpha * q
+        x = x + alpha * p
+        after = r - alpha * q
         found.append(x)
         z_after = inverse @ after
         p = z_after + (after @ z_after) / (r @ z) * p
-        r, z = after, z_after
+        r = after
+        z = z_after
     return found
 
 

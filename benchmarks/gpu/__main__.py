@@ -52,8 +52,12 @@ def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, A
                 max_iterations=iterations,
                 compilation="full",
             )
-            run = lambda options=options: jaxba.solve(problem, "ceres", options)
-            first, second = run(), run()
+
+            def run(options=options):
+                return jaxba.solve(problem, "ceres", options)
+
+            first = run()
+            second = run()
             yield {
                 "dtype": dtype,
                 "refine": refine,
@@ -109,9 +113,16 @@ def scene_throughput(count: int, dtype: Any) -> float:
     states = [
         jaxba.initial_state(la, p, options, dtype) for la, p in zip(layouts, problems, strict=True)
     ]
-    tile = lambda x: jnp.tile(x, (-(-count // len(problems)),) + (1,) * (x.ndim - 1))[:count]
-    stack = lambda trees: jax.tree.map(lambda *leaves: tile(jnp.stack(leaves)), *trees)
-    step = lambda la, s, d: jaxba.lm_step(la, s, d, options)
+
+    def tile(x):
+        return jnp.tile(x, (-(-count // len(problems)),) + (1,) * (x.ndim - 1))[:count]
+
+    def stack(trees):
+        return jax.tree.map(lambda *leaves: tile(jnp.stack(leaves)), *trees)
+
+    def step(la, s, d):
+        return jaxba.lm_step(la, s, d, options)
+
     damping = jnp.full(count, 1e-3, dtype)
     _, _, median, _ = timed(jax.vmap(step), stack(layouts), stack(states), damping, repeats=10)
     return count / median

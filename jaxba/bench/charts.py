@@ -70,12 +70,16 @@ class Style(NamedTuple):
 def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
     """A style for each solver: one of `RESERVED` has its own, others the first that are free, in
     the given order."""
-    names, n = list(dict.fromkeys(solvers)), len(COLOURS)
+    names = list(dict.fromkeys(solvers))
+    n = len(COLOURS)
     taken = {name: RESERVED.index(name) for name in names if name in RESERVED}
     free = (i for i in itertools.count() if i not in taken.values())
     rank = {name: taken[name] if name in taken else next(free) for name in names}
+
     # other ones when colours come again
-    pick = lambda values, i: values[(i + i // n) % len(values)]
+    def pick(values, i):
+        return values[(i + i // n) % len(values)]
+
     return {
         name: Style(COLOURS[i % n], pick(DASHES, i), pick(SYMBOLS, i)) for name, i in rank.items()
     }
@@ -244,7 +248,8 @@ def problem_charts(
     ends = [end for end in map(_end, runs.values()) if 0 < end < math.inf]
     log = bool(ends) and max(ends) / min(ends) > LOG_TIME_SPREAD
     axes = {"iterations": axis("iteration"), "time": axis("solve time (s)", log=log)}
-    f0, f_star = profile.initial_costs(records)[problem], profile.best_cost(records)[problem]
+    f0 = profile.initial_costs(records)[problem]
+    f_star = profile.best_cost(records)[problem]
     gaps = {
         e: profile.relative_threshold(f0, f_star, e) - f_star for e in profile.RELATIVE_TOLERANCES
     }
@@ -260,7 +265,9 @@ def problem_charts(
         p.damping for run in runs.values() for p in run.trace[1:] if math.isfinite(p.damping)
     ]
     zero = min((value for value in dampings if value > 0), default=1e-2) / 100
-    costs, distances, lambdas = [], [], []
+    costs = []
+    distances = []
+    lambdas = []
     for solver, run in runs.items():
         rows = [
             [p.iteration, p.time_s, p.cost, p.damping, "" if p.accepted else ", rejected"]
@@ -269,9 +276,10 @@ def problem_charts(
         x = {name: [row[k] for row in rows] for k, name in enumerate(AXES)}
         # of NaN, `max` keeps the first
         known = [p.cost if math.isfinite(p.cost) else math.nan for p in run.trace]
-        own = lambda y, solver=solver, x=x, rows=rows: line(
-            solver, x, y, styles[solver], customdata=rows, hovertemplate=_ROWS
-        )
+
+        def own(y, solver=solver, x=x, rows=rows):
+            return line(solver, x, y, styles[solver], customdata=rows, hovertemplate=_ROWS)
+
         costs.append(own([max(cost, lowest / 10) for cost in known]))
         distances.append(own([max((cost - f_star) / unit, least) for cost in known]))
         heights = [

@@ -32,7 +32,10 @@ class Page:
         """`facts` are machine, versions and the like, on top; the value of `command` is set as
         code. `styles` are of what a reader can hide, `axes` the positions of the switch of the x
         axis."""
-        self.title, self.facts, self.styles, self.axes = title, facts, styles, axes
+        self.title = title
+        self.facts = facts
+        self.styles = styles
+        self.axes = axes
         self._charts: list[Chart] = []
         self._sections: list[str] = []
 
@@ -46,7 +49,8 @@ class Page:
         """Charts side by side, as many as there is room for."""
         figures = []
         for one in charts:
-            name, note = f"chart{len(self._charts)}", html.escape(one["note"])
+            name = f"chart{len(self._charts)}"
+            note = html.escape(one["note"])
             title = f'<h3>{html.escape(one["title"])}</h3><div id="{name}"></div>'
             figures.append(f"<figure>{title}<figcaption>{note}</figcaption></figure>")
             self._charts.append({**one, "id": name, "note": ""})
@@ -83,9 +87,10 @@ class Page:
 
     def to_html(self, warnings: Sequence[str] = ()) -> str:
         """The document, with warnings on top."""
-        read = lambda package, *path: (
-            resources.files(package).joinpath(*path).read_text(encoding="utf-8")
-        )
+
+        def read(package, *path):
+            return resources.files(package).joinpath(*path).read_text(encoding="utf-8")
+
         page, style, script = (
             read("jaxba.bench", "assets", f"page.{kind}") for kind in ("html", "css", "js")
         )

@@ -176,14 +176,16 @@ def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
 def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str, Reached]]:
     """Iterations and time to a target, `table[solver][problem]`, medians over repeats, without
     pairs not run."""
-    starts, bests = initial_costs(records), best_cost(records)
+    starts = initial_costs(records)
+    bests = best_cost(records)
     found: dict[str, dict[str, list[Reached]]] = {}
     for r in records:
         item = reach(r, target, starts[r.problem], bests[r.problem])
         found.setdefault(r.solver, {}).setdefault(r.problem, []).append(item)
-    median = lambda items: Reached(
-        *(float(statistics.median(values)) for values in zip(*items, strict=True))
-    )
+
+    def median(items):
+        return Reached(*(float(statistics.median(values)) for values in zip(*items, strict=True)))
+
     return {
         solver: {name: median(items) for name, items in row.items()}
         for solver, row in found.items()
@@ -241,7 +243,8 @@ def cost_warnings(records: Sequence[Record]) -> list[str]:
         if not costs:
             lines.append(f"{name}: no solver has a finite initial cost")
             continue
-        low, high = min(costs, key=costs.__getitem__), max(costs, key=costs.__getitem__)
+        low = min(costs, key=costs.__getitem__)
+        high = max(costs, key=costs.__getitem__)
         gap = (costs[high] - costs[low]) / max(abs(costs[high]), abs(costs[low]), 1e-300)
         if gap > COST_DEFINITION_TOLERANCE:
             reason = (

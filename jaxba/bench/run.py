@@ -63,7 +63,10 @@ def run_solver(
     times. The name and family of the source and the number of the repeat, from 0, go into the
     record."""
     steps: list[IterationRecord] = []
-    watch = lambda step: steps.append(step)
+
+    def watch(step):
+        return steps.append(step)
+
     limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances()}
     if solver.peer:
         solution, backend = _solve_by_peer(
@@ -75,7 +78,8 @@ def run_solver(
         options = replace(
             options, linear_solver=linear_solver, pad=settings.pad, compilation="full", **limits
         )
-        solution, backend = solve(problem, policy, options, callback=watch), ""
+        solution = solve(problem, policy, options, callback=watch)
+        backend = ""
     record = record_of(
         solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat
     )
@@ -157,9 +161,10 @@ def open_folder(
     }
     done = _results(folder / RESULTS)
     solved = {record.problem for record in done}
-    used = lambda name: (
-        name in solved or (file_of(name) and any(name in record.solver for record in done))
-    )
+
+    def used(name):
+        return name in solved or (file_of(name) and any(name in record.solver for record in done))
+
     if path.exists():
         try:
             previous = json.loads(path.read_text())
@@ -232,13 +237,16 @@ def execute(
     earlier runs; `on_error` is called for what is skipped, with `strict` also problems that would
     lose a part. Raises OSError: a result cannot be written."""
     finished = {(r.problem, r.solver, r.repeat) for r in done}
-    problem, loaded, broken = None, None, set()
+    problem = None
+    loaded = None
+    broken = set()
     for job in jobs:
         if (job.source.name, str(job.solver), job.repeat) in finished or job.source in broken:
             continue
         if loaded != job.source:
             try:
-                problem, loaded = job.source.read(strict=strict), job.source
+                problem = job.source.read(strict=strict)
+                loaded = job.source
             except ProblemError as error:
                 broken.add(job.source)
                 on_error(error)

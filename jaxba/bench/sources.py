@@ -49,15 +49,20 @@ def sources(locations: list[str]) -> list[Source]:
     of that name; duplicates count once. Raises ProblemError: a missing file or an unknown scene;
     the message is one line."""
     found: list[Source] = []
-    place = lambda one: one if one.startswith(SCENE_PREFIX) else Path(one).resolve()
+
+    def place(one):
+        return one if one.startswith(SCENE_PREFIX) else Path(one).resolve()
+
     for location in locations:
         if location.startswith(SCENE_PREFIX):
             name, seed = _scene(location)
             if name not in DEFAULT_SCENES:
                 scene_like(name)
-            label, family = (f"{name}-{seed}" if seed else name), "scene"
+            label = f"{name}-{seed}" if seed else name
+            family = "scene"
         else:
-            name, location = location, resolve(location)
+            name = location
+            location = resolve(location)
             path = Path(location)
             if not path.is_file() and not holds_problem(path):
                 raise ProblemError(
@@ -69,13 +74,15 @@ def sources(locations: list[str]) -> list[Source]:
             if path.is_dir():
                 label = _model_name(path)
             # reports and figures cannot show bytes that are not valid text
-            label, family = display_name(label), display_name(path.resolve().parent.name)
+            label = display_name(label)
+            family = display_name(path.resolve().parent.name)
         if place(location) in [place(source.location) for source in found]:
             continue
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:
             label = f"{family}-{label}"
-        unique, count = label, 1
+        unique = label
+        count = 1
         while unique in taken:
             count += 1
             unique = f"{label}-{count}"

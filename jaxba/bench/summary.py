@@ -93,9 +93,11 @@ def summarize(records: Sequence[Record], tolerance: float = 1e-3) -> Summary:
     """Computes the statistics of all tables, from any number of records, also none. `tolerance` is
     tau of the target `tau`."""
     targets = (*profile.cost_targets(tolerance), Target("converged"))
-    starts, bests = profile.initial_costs(records), profile.best_cost(records)
+    starts = profile.initial_costs(records)
+    bests = profile.best_cost(records)
     tables = {target.key: profile.reach_table(records, target) for target in targets}
-    names, solvers = profile.problem_names(records), profile.solver_names(records)
+    names = profile.problem_names(records)
+    solvers = profile.solver_names(records)
     found = {
         key: {s: profile.reached(table.get(s, {}), names) for s in solvers}
         for key, table in tables.items()

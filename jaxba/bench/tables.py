@@ -50,7 +50,8 @@ def compact(summary: Summary) -> Table:
     )
     rows = []
     for s in summary.solvers:
-        near, end = s.targets["relative_0.001"], s.targets["converged"]
+        near = s.targets["relative_0.001"]
+        end = s.targets["converged"]
         counts = [f"{one.reached}/{one.total}" for one in (near, end)]
         means = [number(x) for x in (near.iterations_capped, near.seconds, end.iterations_capped)]
         ends = counts[1], number(s.final_ratio_worst, 5), f"{s.compile_s:.1f}"
@@ -71,7 +72,8 @@ def reach_tables(summary: Summary) -> list[Table]:
     """Iterations, and seconds, to every tolerance."""
     targets = [target for target in summary.targets if target.kind != "converged"]
     header = ("solver", *(target.label for target in targets))
-    iterations, seconds = [], []
+    iterations = []
+    seconds = []
     for name, by_key in ((s.solver, s.targets) for s in summary.solvers):
         cells = [by_key[target.key] for target in targets]
         reached = [f"{cell.reached}/{cell.total}" for cell in cells]

@@ -97,9 +97,10 @@ def _held_out(
         rows, f"held_out/{'score' if field == 'mean' else field}", styles[TRAINED], scale
     )
     ends = {name: [traces[-1]["x"][name][k] for k in (0, -1)] for name in AXES} if traces else {}
-    level = lambda name, one: line(
-        name, ends, [scale * getattr(one, field)] * 2, styles[name], marked=False
-    )
+
+    def level(name, one):
+        return line(name, ends, [scale * getattr(one, field)] * 2, styles[name], marked=False)
+
     return _over(
         HELD_OUT[field], [*traces, *(level(name, one) for name, one in rules.items() if traces)]
     )
@@ -140,7 +141,10 @@ def _curve(
         "hoverinfo": "skip",
     }
     low, high = ({**edge, "y": [end(ys) for ys in values]} for end in (min, max))
-    of = lambda k: [ys[k] if k < len(ys) else float("nan") for ys in values]
+
+    def of(k):
+        return [ys[k] if k < len(ys) else float("nan") for ys in values]
+
     single = [
         line(TRAINED, x, of(k), style, label=f"agent {k + 1}", marked=False, opacity=0.5)
         for k in range(most)
@@ -151,7 +155,8 @@ def _curve(
 
 def _episodes(title: str, episodes: Trajectories, start: int) -> Chart:
     """Lambda (from iteration 1) or cost (from 0) over the iterations of some episodes."""
-    values, traces = (episodes.dampings if start else episodes.costs), []
+    values = episodes.dampings if start else episodes.costs
+    traces = []
     for k, count in enumerate(episodes.iterations[:EPISODES]):
         style = Style(COLOURS[k % len(COLOURS)], "solid", SYMBOLS[k % len(SYMBOLS)])
         rejected = np.diff(episodes.costs[k, : count + 1]) >= 0

@@ -182,7 +182,8 @@ def _run_missing(
 
 def _line(problem: str, records: Any) -> str:
     seconds = sum(one.setup_s + one.compile_s + one.total_s for one in records)
-    compiled, cost = sum(one.compile_s for one in records), min(one.final_cost for one in records)
+    compiled = sum(one.compile_s for one in records)
+    cost = min(one.final_cost for one in records)
     runs = common.counted(len(records), "run")
     return (
         f"{problem}: {runs} in {seconds:.1f} s ({compiled:.1f} s of compilation), least cost "

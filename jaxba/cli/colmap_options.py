@@ -66,7 +66,10 @@ def translated(argv: Sequence[str]) -> list[str]:
     """A command line with COLMAP's options replaced. All constants are gathered in one
     `--constant`. Raises UsageError: an option of COLMAP that has no meaning here, or no value; one
     line."""
-    found, paths, constants, words = [], [], [], list(argv)
+    found = []
+    paths = []
+    constants = []
+    words = list(argv)
     while words:
         word = words.pop(0)
         name, equals, value = word.partition("=")

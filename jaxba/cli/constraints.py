@@ -29,7 +29,10 @@ def surveyed(
     `strict` is as for `jaxba.survey`. Raises UsageError: something is not in the problem; one line
     that names the option or the key. Raises ProblemError: as the functions of `jaxba` that do
     it."""
-    held = lambda one: _held(one, constant)
+
+    def held(one):
+        return _held(one, constant)
+
     try:
         found, in_file = constrained(problem, file or {}, model=path, strict=strict, held=held)
     except ConstraintError as error:

@@ -88,10 +88,8 @@ def _list(args: List) -> int:
         )
     for entry in select(args.names) if args.names else ENTRIES:
         file = entry.file.partition("/")[2]
-        known, here = (
-            ("known" if entry.sha256 else "no"),
-            ("yes" if downloaded_path(entry) else "no"),
-        )
+        known = "known" if entry.sha256 else "no"
+        here = "yes" if downloaded_path(entry) else "no"
         table.add_row(entry.name, str(entry.cameras), str(entry.points), file, known, here)
     console = common.console()
     console.print(table)
@@ -112,7 +110,8 @@ def _download(args: Download) -> int:
     from jaxba.datasets.bal.paths import data_folder, select
 
     common.require(bool(args.names), "name a problem or a family; jaxba-data list shows them")
-    entries, folder = select(args.names), data_folder()
+    entries = select(args.names)
+    folder = data_folder()
     common.check_extra("jaxba.datasets.bal.download")
     from jaxba.datasets.bal import download
 

@@ -3,6 +3,7 @@ trajectory errors."""
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import sys
@@ -154,7 +155,7 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     poses = None
     if args.poses is not None:
         table = read_poses(args.poses)
-        poses = lambda frames: poses_of(table, frames, sequence.calibration)
+        poses = functools.partial(poses_of, table, calibration=sequence.calibration)
         poses(sequence.numbers)  # raises errors before any work is done
     center = (sequence.calibration.cx, sequence.calibration.cy)
     note_center(
@@ -190,7 +191,8 @@ def _build_table(title: str, problem: BundleProblem, frames: tuple[int, ...], po
         "mean error (px)",
         "ATE of the start (m)",
     )
-    error, ate = np.linalg.norm(geometry.residuals(problem), axis=1).mean(), "-"
+    error = np.linalg.norm(geometry.residuals(problem), axis=1).mean()
+    ate = "-"
     if poses is not None:
         try:
             scores = evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))
@@ -209,7 +211,8 @@ def _build_table(title: str, problem: BundleProblem, frames: tuple[int, ...], po
 
 
 def _evaluate(args: EvaluateArguments) -> int:
-    files, folder = [args.problem, *args.solutions], Path(args.out)
+    files = [args.problem, *args.solutions]
+    folder = Path(args.out)
     names = [
         f"poses-{number}-{Path(strip_compression(path)).stem}.txt"
         for number, path in enumerate(files)

@@ -42,7 +42,8 @@ def options(cls: type[Arguments]) -> type[Arguments]:
     The text below a field is its help, whatever the lengths of its lines. A text in the annotation,
     `Annotated[str, "FILE"]`, stands for the value in the help. A class that inherits from several
     such classes has their options, in the help a group for each class."""
-    texts, hints = _texts(cls), get_type_hints(cls, include_extras=True)
+    texts = _texts(cls)
+    hints = get_type_hints(cls, include_extras=True)
     for name in cls.__annotations__:
         default = getattr(cls, name, None)
         kind, *extras = (

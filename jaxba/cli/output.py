@@ -115,7 +115,8 @@ def fitting(solution: Solution) -> BundleProblem:
 def write_solution(output: str, solution: Solution, source: str | None) -> None:
     """Writes the solution, and prints what was written and what the file cannot store. Raises
     UsageError: it fails."""
-    model, cameras = is_model(output, source), _is_transforms(output, source)
+    model = is_model(output, source)
+    cameras = _is_transforms(output, source)
     like = source is not None and is_colmap(source) and (model or cameras)
     try:
         store(output, solution, source)

@@ -127,7 +127,8 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
         try:
             for number, entry in enumerate(wanted, start=1):
                 console.print(f"{number} of {len(wanted)}: {entry.title}")
-                started, before = time.perf_counter(), runner.done
+                started = time.perf_counter()
+                before = runner.done
                 entry.run(runner)
                 spent = time.perf_counter() - started
                 console.print(f"  {common.counted(runner.done - before, 'run')}, {spent:.1f} s")

@@ -59,10 +59,12 @@ def inputs(problems: Sequence[str]) -> list[str]:
     """The paths of several problems; of a folder that is none itself what it holds. Empty for a
     single problem. Raises UsageError: one is standard input. Raises ProblemError: as `resolve`."""
     common.require(len(problems) < 2 or "-" not in problems, "- is for one problem")
-    found, folders = list[str](), 0
+    found = list[str]()
+    folders = 0
     for path in map(resolve, problems):
         if Path(path).is_dir() and not formats.holds_problem(path):
-            inside, folders = sorted(Path(path).iterdir()), folders + 1
+            inside = sorted(Path(path).iterdir())
+            folders = folders + 1
             found += [str(one) for one in inside if one.is_file() or formats.holds_problem(one)]
         else:
             found.append(path)
@@ -91,7 +93,9 @@ def solve_all(
     done = _begin(folder, paths, names, made_by, resume=args.resume) if folder else {}
     left = [(path, name) for path, name in zip(paths, names, strict=True) if name not in done]
     common.prepare_process()
-    began, shown, rows = time.monotonic(), -1e9, list[Row]()
+    began = time.monotonic()
+    shown = -1e9
+    rows = list[Row]()
     every, end = (PROGRESS_S[0], "") if sys.stderr.isatty() else (PROGRESS_S[1], "\n")
     problems = _Problems([path for path, _ in left], read)
     found = contextlib.closing(solve_many(problems, policy, options))
@@ -104,12 +108,14 @@ def solve_all(
                 append_row(folder / COSTS, rows[-1])
             now = time.monotonic()
             if not isinstance(result, Solution):
-                text, known = rows[-1].error, display_name(path)
+                text = rows[-1].error
+                known = display_name(path)
                 common.print_error(text if text.startswith(known) else f"{known}: {text}")
             elif rows[-1].notes:
                 common.print_line(f"note: {display_name(path)}: {rows[-1].notes}")
             elif now - shown > every:
-                rate, shown = len(rows) / (now - began), now
+                rate = len(rows) / (now - began)
+                shown = now
                 text = f"{len(rows)} of {len(left)}, {rate:.1f} a second"
                 print(text if end else f"\r{text} ", end=end, file=sys.stderr, flush=True)
             if interrupt.requested:
@@ -117,7 +123,10 @@ def solve_all(
     print(end="" if end else "\n", file=sys.stderr)
     solved = [row for row in rows if not row.error]
     failed = len(rows) - len(solved)
-    total = lambda name: sum(float(getattr(row, name)) for row in solved)
+
+    def total(name):
+        return sum(float(getattr(row, name)) for row in solved)
+
     common.print_line(
         f"{common.counted(len(solved), 'problem')} solved, {failed} failed, in "
         f"{time.monotonic() - began:.1f} s\n"
@@ -142,7 +151,8 @@ class _Problems:
     """Problems that are read when their turn comes; what cannot be read is the error itself."""
 
     def __init__(self, paths: Sequence[str], read: Callable[[str], BundleProblem]) -> None:
-        self._paths, self._read = paths, read
+        self._paths = paths
+        self._read = read
         self.digests = dict[str, str]()
         """Of the files of each problem, from before it was read."""
 
@@ -222,7 +232,8 @@ def _begin(
     if rows:
         common.print_line(f"{len(done)} of {len(paths)} are there already")
     if anew:
-        changed, lost = len(there - done), len(anew) - len(there - done)
+        changed = len(there - done)
+        lost = len(anew) - len(there - done)
         common.print_line(
             f"solved anew: {changed} whose files have changed, {lost} whose solutions are not there"
         )

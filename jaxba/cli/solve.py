@@ -284,7 +284,8 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
     try:
         policy, options = adjusted(*solver_name(args).build(), args.repairs, args.min_gain)
         trained = options.step_options(policy).coordinates
-        scaling, rotation = args.scaling or trained.scaling, args.rotation or trained.rotation
+        scaling = args.scaling or trained.scaling
+        rotation = args.rotation or trained.rotation
         options = replace(
             options,
             linear_solver=args.linear_solver,
@@ -613,7 +614,9 @@ def _iterate(
             return solve(problem, policy, options, checkpoint=args.checkpoint, **hooks), steps
         from jaxba.results.alternation import solve_and_retriangulate
 
-        show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))
+        def show_search(found):
+            return common.print_line(table.retriangulated(found, args.ftol))
+
         return solve_and_retriangulate(
             problem, policy, options, on_search=show_search, **hooks
         ), steps

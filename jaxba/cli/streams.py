@@ -25,7 +25,8 @@ class TolerantStream:
     def __init__(self, stream: Any, *, discard_all: bool) -> None:
         """`discard_all`: after any other error, too, instead of raising an
         `UnwritableStreamError`."""
-        self._stream, self._discard_all = stream, discard_all
+        self._stream = stream
+        self._discard_all = discard_all
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -79,10 +80,12 @@ def tolerant_streams() -> Iterator[None]:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     with open(os.devnull, "w") as nothing:  # for streams that were closed from the start
-        wrap = lambda stream, discard_all: TolerantStream(
-            stream or nothing, discard_all=discard_all
-        )
-        sys.stdout, sys.stderr = wrap(before[0], False), wrap(before[1], True)
+
+        def wrap(stream, discard_all):
+            return TolerantStream(stream or nothing, discard_all=discard_all)
+
+        sys.stdout = wrap(before[0], False)
+        sys.stderr = wrap(before[1], True)
         try:
             yield
         finally:

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """Size of the problem, and the policy and options of the solve."""
-    work, coordinates = options.refinement, options.coordinates
+    work = options.refinement
+    coordinates = options.coordinates
     start = " from the better of step and rays" if work.starts == "rays" else ""
     parts = {
         f" + {counted(work.points, 'point iteration')}{start}": work.points,
@@ -77,7 +78,8 @@ def _constants(problem: BundleProblem) -> list[str]:
     if problem.constants is None:
         return []
     poses = np.asarray(problem.constants.poses)
-    whole, points = int(poses.all(axis=1).sum()), int(np.sum(problem.constants.points))
+    whole = int(poses.all(axis=1).sum())
+    points = int(np.sum(problem.constants.points))
     part = int(poses.any(axis=1).sum()) - whole
     found = (whole, "constant pose"), (part, "partly constant pose"), (points, "constant point")
     return [counted(count, what) for count, what in found if count]
@@ -97,7 +99,8 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     """The result of a solve in a few lines. `loss` is that of the solve; None: squared
     residuals."""
     state = "converged" if solution.converged else "not converged"
-    left_out, notes = rejected(solution), solution.notes
+    left_out = rejected(solution)
+    notes = solution.notes
     sizes = solution.num_residuals, solution.num_parameters
     if solution.rejected is None:
         problem, end = (
@@ -149,7 +152,8 @@ def rejected(solution: Solution) -> list[str]:
     """A note on observations that were rejected, by image, and on images that lost all of them."""
     if solution.rejected is None:
         return []
-    problem, count = solution.problem, len(solution.rejected)
+    problem = solution.problem
+    count = len(solution.rejected)
     gone, views = (
         np.bincount(problem.camera_index[mask], minlength=problem.num_cameras)
         for mask in (solution.rejected, slice(None))

@@ -107,7 +107,10 @@ def _train(args: Arguments, command: str) -> int:
             # they were printed when the problems were checked
             with common.notes_printed(lambda _: None):
                 loops: list[Any] = []
-                compiling = lambda game: loops.append(driver.begin_compiling(config, game))
+
+                def compiling(game):
+                    return loops.append(driver.begin_compiling(config, game))
+
                 work = task.build(config, folder, stages, on_game=compiling)
             best: list[int] = []  # chunks of the best policies
             began: list[tuple[float, int]] = []  # when training began, and after which chunk
@@ -119,7 +122,8 @@ def _train(args: Arguments, command: str) -> int:
 
             def show(rows: list[Any]) -> None:
                 agent = config.game.agent
-                decades, row = (agent.high - agent.low) / 2, rows[0]
+                decades = (agent.high - agent.low) / 2
+                row = rows[0]
                 if not began:
                     began.append(
                         (
@@ -161,7 +165,8 @@ class _Stages:
         """Ends the stage before, and begins another one."""
         now = time.perf_counter()
         self._print(f"{self._text}: {now - self._begun:.1f} s")
-        self._text, self._begun = text, now
+        self._text = text
+        self._begun = now
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:
@@ -219,14 +224,16 @@ def _finish(
     from jaxba.training import log
     from jaxba.training.driver import best_of
 
-    files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
+    files = _write_policies(folder, work.config, work, best)
+    rows = log.read(folder)
     rules_of_game = work.config.game
     stages("comparing with the rules")
     compared = work.compare([one.actor for one in best])
     table = _table(compared, rules_of_game.tolerance, len(work.held_out.initial_cost))
     stages("episodes and page")
     chosen = best_of(best)
-    policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
+    policy = work.policy(chosen.actor)
+    limit = rules_of_game.max_iterations
     episodes = play(work.game.kind, work.held_out, policy, work.game.options, limit)
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE

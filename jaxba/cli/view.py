@@ -145,7 +145,9 @@ def watched(
         return None, lambda: None
     from jaxba.viewer.recording import Recorder, write_recording
 
-    recorder, drawn, viewer = Recorder(problem, path or ""), 0.0, None
+    recorder = Recorder(problem, path or "")
+    drawn = 0.0
+    viewer = None
     if show:
         from jaxba.viewer.page import Viewer
         from jaxba.viewer.sources import shown

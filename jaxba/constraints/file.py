@@ -69,7 +69,8 @@ class Survey(ArrayRecord):
     def report(self, solution: Solution) -> Report:
         """What a solve of the problem made of control points, check points and distances, and what
         does not fit."""
-        problem, gone = solution.problem, solution.rejected
+        problem = solution.problem
+        gone = solution.rejected
         return report(
             problem if gone is None else problem.subset(~gone), self.marks, solution.notes
         )
@@ -140,7 +141,8 @@ def constrained(
                 problem, f"{file}: {key}", settings.pop(key), strict, frame
             )
     with _named(file, key := "control_points"):
-        marks, value = None, settings.get(key)
+        marks = None
+        value = settings.get(key)
         if isinstance(value, dict) and "file" in value:
             problem, marks = with_control_points(
                 problem, f"{file}: {key}", settings.pop(key), strict, frame, model

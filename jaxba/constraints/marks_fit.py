@@ -26,7 +26,8 @@ EDGE = 0.01
 SIZES = tuple(np.geomspace(0.1, 10.0, 47).tolist())
 """Sizes of photos in which marks may have been made, over those of the images: steps of a tenth."""
 
-BETTER, LEAST_LEFT = 0.1, 4
+BETTER = 0.1
+LEAST_LEFT = 4
 """Pixels of other photos are taken for the true ones if they leave this share of the misfit, with
 so many numbers more than the marks have."""
 
@@ -74,7 +75,8 @@ def outside_text(
     width, height = clicks.sizes[first].tolist()
     others = int(out.sum()) - 1
     more = f", and {others} more" if others else ""
-    name, image = names[clicks.mark[first]], images[clicks.image[first]]
+    name = names[clicks.mark[first]]
+    image = images[clicks.image[first]]
     text = (
         f"pixels of {name} lie outside of {image} ({width:g} x {height:g}){more}: photos of "
         "another size, or turned?"

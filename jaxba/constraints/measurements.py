@@ -47,7 +47,9 @@ def with_measured(
     cannot be; one line."""
     if key == "depths":
         return _with_depths(problem, where, value, strict, model)
-    kind, what, loss = "point" if key in ("control_points", "distances") else "image", "pairs", None
+    kind = "point" if key in ("control_points", "distances") else "image"
+    what = "pairs"
+    loss = None
     if key == "distances":
         items, columns = values.parse_pairs(value, kind, {"length": ((),), "stddev": ((),)})
     elif key == "relative_poses":
@@ -70,7 +72,8 @@ def with_measured(
     if (at[:1] == at[1:]).any():
         raise ValueError(f"a pair has the same {kind} twice")
     columns = {name: [column[k] for k in kept] for name, column in columns.items()}
-    stddev, of = np.stack(columns["stddev"]), columns.get(what)
+    stddev = np.stack(columns["stddev"])
+    of = columns.get(what)
     if key == "control_points":
         rows = residuals.control_point(
             point=at[0], position=of, whitening=np.eye(3) / stddev[:, None]
@@ -92,9 +95,10 @@ def with_measured(
                 raise ValueError(
                     f"{pair}: rotation: must be a quaternion of length one, not [{written}]"
                 )
-        read = lambda x: (
-            Rotation.from_quat(np.roll(x, -1)) if len(x) == 4 else Rotation.from_rotvec(x)
-        )
+
+        def read(x):
+            return Rotation.from_quat(np.roll(x, -1)) if len(x) == 4 else Rotation.from_rotvec(x)
+
         rotation = np.stack([read(x).as_matrix() for x in columns["rotation"]])
         whitening = np.eye(6) / np.repeat(stddev, 3, axis=1)[:, None]
         data = {"rotation": rotation, "translation": columns["translation"], "whitening": whitening}
@@ -215,7 +219,8 @@ def _with_depths(
     model, or else the middle of the map. Raises ValueError: a map has another shape than its image,
     or disparities; one line."""
     values.parse_mapping(value, ["folder", "stddev"], ["loss", "loss_scale"])
-    folder, loss = values.beside(where, value, "folder"), values.parse_loss(value)
+    folder = values.beside(where, value, "folder")
+    loss = values.parse_loss(value)
     if not folder.is_dir():
         raise ValueError(f"folder: there is no folder {folder}")
     relative = values.parse_deviations("stddev", value["stddev"])[0]
@@ -227,7 +232,8 @@ def _with_depths(
     files = files_of_images(folder, names, ".npy")
     missing = [name for name, file in zip(names, files, strict=True) if file is None]
     leave_out(where, "image", "{} without a map", missing, strict)
-    camera, measured = np.asarray(problem.camera_index), np.full(problem.num_observations, np.nan)
+    camera = np.asarray(problem.camera_index)
+    measured = np.full(problem.num_observations, np.nan)
     placed = depth_maps.pixels_of_images(problem, model)
     for at, file in enumerate(files):
         if file is not None:
@@ -237,7 +243,8 @@ def _with_depths(
     if not len(kept):
         raise ValueError(f"{folder}: no map has a depth at a pixel of the problem")
     images, image = np.unique(camera[kept], return_inverse=True)
-    measured, depths = measured[kept], geometry.depths(problem)[kept]
+    measured = measured[kept]
+    depths = geometry.depths(problem)[kept]
     depth_maps.refuse_disparities(folder, image, measured, depths)
     ratio = measured / depths
     start = [[np.median(ratio[image == k]), 0.0] for k in range(len(images))]

@@ -99,8 +99,12 @@ def report(problem: BundleProblem, marks: Marks | None, notes: tuple[str, ...] =
     """The report of a solved problem and its marks, with the points and distances of the residuals
     that it has, and notes on what does not fit."""
     first = problem.num_points - (0 if marks is None else len(marks.names))
-    name = lambda one: part_name(problem.labels, "point", one).removeprefix("point ")
-    groups, lengths = [], list[Row]()
+
+    def name(one):
+        return part_name(problem.labels, "point", one).removeprefix("point ")
+
+    groups = []
+    lengths = list[Row]()
     if marks is not None:
         kinds = np.where(marks.check, "check", "control").tolist()
         groups.append(
@@ -113,7 +117,8 @@ def report(problem: BundleProblem, marks: Marks | None, notes: tuple[str, ...] =
             rows.residual.function is residuals.control_point.function
             and (own := at[0] < first).any()
         ):
-            of, stddev = at[0][own], 1 / np.einsum("nii->ni", data["whitening"][own])
+            of = at[0][own]
+            stddev = 1 / np.einsum("nii->ni", data["whitening"][own])
             groups.append(
                 (
                     ["control"] * len(of),
@@ -137,7 +142,8 @@ def report(problem: BundleProblem, marks: Marks | None, notes: tuple[str, ...] =
     for kinds, names, of, places, stddev in groups:
         found = found_at(problem, of, places, stddev)
         known = np.where(found.images > 0, 1, np.nan)  # else the measurement alone says where it is
-        by, sigmas = found.difference * known[:, None], found.whitened * known
+        by = found.difference * known[:, None]
+        sigmas = found.whitened * known
         columns = (places, by, sigmas, found.images, found.pixels)
         for kind, own, place, by, *more in zip(
             kinds, names, *(x.tolist() for x in columns), strict=True

@@ -49,8 +49,10 @@ def with_positions(
         report([f"{where}: positions are taken as of {crs}, which the scene gets"])
     degrees = given.degrees or (crs != "" and is_geographic(crs))
     chosen = _with_a_place(where, given, images, kept, degrees, strict)
-    images, kept = images[chosen], kept[chosen]
-    places, covariances = given.places[kept], given.covariances
+    images = images[chosen]
+    kept = kept[chosen]
+    places = given.places[kept]
+    covariances = given.covariances
     report([f"{where}: {note}" for note in given.notes])
     if crs:
         places, frame = in_frame(places, crs, frame, units=given.units, where=where)

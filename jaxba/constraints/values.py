@@ -95,7 +95,8 @@ def parse_pairs(
     else; one line."""
     if not isinstance(value, list) or not value:
         raise ValueError(f"must be a list of mappings, not {_written(value)}")
-    pairs, columns = [], {name: [] for name in shapes}
+    pairs = []
+    columns = {name: [] for name in shapes}
     for item in value:
         pairs.append(
             parse_items(parse_mapping(item, [f"{kind}s", *shapes])[f"{kind}s"], f"two {kind}s")

@@ -81,7 +81,9 @@ class Rescue(NamedTuple):
     def after(self, step: StepInfo, patience: int, most: int) -> tuple[Rescue, Float[Array, ""]]:
         """The state after a step, and log10 of the next lambda in case that it is in charge: after
         `patience` rejections in a row, or `most` in all, it takes over."""
-        rule, dtype, accepted = Ceres(), self.worked.dtype, step.accepted
+        rule = Ceres()
+        dtype = self.worked.dtype
+        accepted = step.accepted
         decades = jnp.log10(step.damping).astype(dtype)
         worked = jnp.where(accepted, decades, self.worked).astype(dtype)
         in_a_row = jnp.where(accepted, 0, self.in_a_row + 1).astype(jnp.int32)

@@ -92,7 +92,10 @@ def observation_size(config: AgentConfig) -> int:
 def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
     """Before the first iteration."""
     dtype = info.cost.dtype
-    number = lambda x: jnp.asarray(x, dtype)
+
+    def number(x):
+        return jnp.asarray(x, dtype)
+
     error = (
         jnp.minimum(_rms_error(info, info.cost), PAPER_LIMIT)
         if config.observation == "paper"
@@ -116,7 +119,8 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
     """What the network sees, float32."""
     if config.observation != "scale-free":
         return memory.errors.astype(jnp.float32)
-    info, rescue = memory.info, memory.guard.rescue
+    info = memory.info
+    rescue = memory.guard.rescue
     unknowns = 9.0 * info.cameras + 3.0 * info.points
     solve = [
         _log(info.cost / memory.cost) / 3,
@@ -140,9 +144,13 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
 def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     """After an iteration."""
     dtype = memory.cost.dtype
-    damping, gain = jnp.log10(step.damping).astype(dtype), finite_gain(step).astype(dtype)
+    damping = jnp.log10(step.damping).astype(dtype)
+    gain = finite_gain(step).astype(dtype)
     decrease = (step.previous_cost - step.cost) / step.previous_cost
-    scaled = lambda x: (_log(x + FLOOR) + 4.5) / 4.5
+
+    def scaled(x):
+        return (_log(x + FLOOR) + 4.5) / 4.5
+
     features = StepFeatures(
         present=jnp.ones((), dtype),
         decrease=_log(step.previous_cost / step.cost),
@@ -162,10 +170,13 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         "duration": lambda: -duration(step),
         "scale-free": lambda: jnp.zeros((), dtype),
     }[config.observation]()
-    shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])
-    pick = lambda if_accepted, if_rejected: jnp.where(
-        step.accepted, if_accepted, if_rejected
-    ).astype(dtype)
+
+    def shifted(old, new):
+        return jnp.concatenate([new[None].astype(dtype), old[:-1]])
+
+    def pick(if_accepted, if_rejected):
+        return jnp.where(step.accepted, if_accepted, if_rejected).astype(dtype)
+
     return Memory(
         info=memory.info,
         iteration=(memory.iteration + 1).astype(jnp.int32),

@@ -26,7 +26,8 @@ from jaxba.damping.default_policy import Rescue, is_inexact, smallest_decades, t
 from jaxba.damping.rules import LARGEST
 from jaxba.lm.records import StepInfo
 
-OVERDAMPED_DECREASE, OVERDAMPED_FRACTION = 1e-2, 0.5
+OVERDAMPED_DECREASE = 1e-2
+OVERDAMPED_FRACTION = 0.5
 """A step of full length is overdamped if its relative decrease is below the first number and
 damping's share of its curvature above the second. The next lambda must then be ten times smaller,
 or a solve could stop making progress without having converged. Shortened steps do not count: in a
@@ -55,10 +56,8 @@ def initial_guard(config: AgentConfig, dtype: Any) -> GuardState:
 def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> GuardState:
     """After an iteration."""
     rescue, rule = guard.rescue.after(step, config.patience, config.max_rejections)
-    damping, failures = (
-        jnp.log10(step.damping),
-        jnp.where(step.accepted, times_shortened(step), 1.0),
-    )
+    damping = jnp.log10(step.damping)
+    failures = jnp.where(step.accepted, times_shortened(step), 1.0)
     lowest = jnp.where(is_inexact(step), damping, damping - config.descent)
     lowest = jnp.where(
         failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest
@@ -66,7 +65,10 @@ def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> Guar
     decrease = (step.previous_cost - step.cost) / step.previous_cost
     weak = (decrease < OVERDAMPED_DECREASE) & (step.damping_fraction > OVERDAMPED_FRACTION)
     highest = jnp.where(step.accepted & (step.step_fraction == 1) & weak, damping - 1, UNLIMITED)
-    decided = lambda limit: jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
+
+    def decided(limit):
+        return jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
+
     return GuardState(decided(lowest), decided(highest), rescue)
 
 

@@ -51,7 +51,10 @@ class ProblemInfo(NamedTuple):
     ) -> ProblemInfo:
         """The fields, of their types: `seen` says which cameras are observed, `focal` has their
         focal lengths."""
-        count = lambda n: jnp.asarray(n, jnp.int32)
+
+        def count(n):
+            return jnp.asarray(n, jnp.int32)
+
         return cls(
             cost=cost,
             observations=count(observations),

@@ -33,7 +33,8 @@ from jaxba.problem.checks import shown
 from jaxba.typing import InputError
 
 # the shipped network, for lambda alone, and the guard of agents without a network
-LEARNED, BOLD = "learned", "bold"
+LEARNED = "learned"
+BOLD = "bold"
 GUARDED = "guarded"  # the default policy of a solve
 
 SHIPPED = Path(__file__).parent.parent / "policies" / "default.safetensors"

@@ -96,7 +96,10 @@ class GameConfig:
 def _check_reward(reward: RewardFunction) -> None:
     """Traces a user's reward. Raises ValueError: it cannot be traced, or returns anything but one
     number."""
-    scalar = lambda kind: jax.ShapeDtypeStruct((), kind)
+
+    def scalar(kind):
+        return jax.ShapeDtypeStruct((), kind)
+
     step = StepInfo._make(scalar(KINDS.get(name, jnp.float32)) for name in StepInfo._fields)
     try:
         found = jax.eval_shape(
@@ -199,7 +202,8 @@ class Game:
         self, bank: Bank, episode: Episode, action: Float[Array, " actions"]
     ) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
-        agent, memory = self.config.agent, episode.memory
+        agent = self.config.agent
+        memory = episode.memory
         layout = class_layout(self.kind, self.options)
         layout = with_scene(
             layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene]
@@ -234,7 +238,10 @@ class Game:
         reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
         following = jax.tree.map(lambda new, old: jnp.where(terminated, new, old), fresh, after)
-        single = lambda x: jnp.asarray(x, jnp.float32)
+
+        def single(x):
+            return jnp.asarray(x, jnp.float32)
+
         metrics = {
             "length": single(after.memory.iteration),
             "success": single(success),
@@ -284,7 +291,8 @@ class Game:
 
 def _rule_damping(memory: Memory) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    rule, rejections = Ceres(), memory.guard.rescue.in_a_row
+    rule = Ceres()
+    rejections = memory.guard.rescue.in_a_row
     factor = rule.factor(rejections == 0, memory.gain, rule.reject_growth * 2.0 ** (rejections - 1))
     return memory.damping + jnp.where(memory.iteration == 0, 0.0, jnp.log10(factor))
 

@@ -93,9 +93,10 @@ def best_constant_action(
     tried = {str(action): action for action in CONSTANT_ACTIONS}
     own = {name: (always(action, rules.agent), options) for name, action in tried.items()}
     steps = alike({**(beside or {}), **own})
-    mean = lambda name: (
-        evaluate(kind, bank, *steps[name], rules.tolerance, rules.max_iterations).mean
-    )
+
+    def mean(name):
+        return evaluate(kind, bank, *steps[name], rules.tolerance, rules.max_iterations).mean
+
     return tried[min(tried, key=mean)]
 
 
@@ -130,7 +131,8 @@ def scores(
 
     The best cost of a scene is the lowest one of the bank and of all these runs, the same for all
     scores."""
-    runs, every = {**policies, **rules}, rules.values()
+    runs = {**policies, **rules}
+    every = rules.values()
     lowest = Trajectories(
         costs=np.min([run.costs for run in every], axis=0),
         dampings=next(iter(every)).dampings,

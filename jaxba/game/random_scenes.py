@@ -37,7 +37,9 @@ OUTLIER_ERROR = (5.0, 100.0)  # largest error of a wrong match in pixels, log-un
 FOCAL = (300.0, 4000.0)  # focal length in pixels, log-uniform per scene
 CANDIDATES = 3  # points drawn per point that is kept, since many are seen by one camera only
 
-START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.25)
+START_ROTATION = (1e-5, 0.03)
+START_CENTER = (1e-3, 0.3)
+START_DEPTH = (1e-3, 0.25)
 """Sigmas of the error of the start, log-uniform per scene: rotations in radians, centres in units
 of the distance of neighbouring cameras, depths of points relative to the true ones."""
 
@@ -48,7 +50,8 @@ centres and points in lengths, where points fill a cube of side 4. Chosen so tha
 on 6%, Ceres' rule takes 8.1 in the mean."""
 
 
-MOST_CAMERAS, MOST_POINTS = DENSE_UNKNOWNS // 9, TILED_POINTS - 2
+MOST_CAMERAS = DENSE_UNKNOWNS // 9
+MOST_POINTS = TILED_POINTS - 2
 """Of a class, 56 and 510. Its scenes share the layout of one in which every camera sees every
 point: a single bucket of points, with slots ordered camera by camera, and a dense product that
 forms the reduced camera system. Layouts of larger problems have tiles and pairs; from which sizes
@@ -107,7 +110,10 @@ def _log_uniform(key: Array, low: float, high: float, shape: tuple[int, ...] = (
 
 def _look_at(forward: Array, up: Array) -> Float[Array, "n 3 3"]:
     """Rotations world to camera of cameras that look along `forward`: -z ahead, y up."""
-    unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+
+    def unit(v):
+        return v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+
     back = -unit(forward)
     right = unit(jnp.cross(up, back))
     return jnp.stack([right, jnp.cross(back, right), back], axis=-2)
@@ -146,9 +152,10 @@ def _path(motion: Array, key: Array, cameras: int) -> tuple[Array, Array]:
 
 def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     keys = iter(jax.random.split(key, 24))
-    uniform = lambda low, high, shape=(): jax.random.uniform(
-        next(keys), shape, minval=low, maxval=high
-    )
+
+    def uniform(low, high, shape=()):
+        return jax.random.uniform(next(keys), shape, minval=low, maxval=high)
+
     motion = jax.random.randint(next(keys), (), 0, len(MOTIONS))
     cameras = jnp.floor(_log_uniform(next(keys), 4.0, kind.cameras + 1.0)).astype(int)
     points = jnp.floor(
@@ -176,7 +183,8 @@ def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     )
     # tracks before single views
     first = jnp.argsort(jnp.sum(seen, axis=0) < 2, stable=True)[: kind.points]
-    reference, world = reference[first], world[first]
+    reference = reference[first]
+    world = world[first]
     seen = _enough(seen[:, first] & (jnp.arange(kind.points) < points))
 
     wrong = jax.random.bernoulli(next(keys), OUTLIERS[0]) * _log_uniform(next(keys), *OUTLIERS[1:])
@@ -268,9 +276,10 @@ def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[
     lens, wrong depths."""
     keys = iter(jax.random.split(key, 24))
     cameras = rig.center.shape[0]
-    sometimes = lambda chance, low, high: (
-        jax.random.bernoulli(next(keys), chance) * _log_uniform(next(keys), low, high)
-    )
+
+    def sometimes(chance, low, high):
+        return jax.random.bernoulli(next(keys), chance) * _log_uniform(next(keys), low, high)
+
     turn = jnp.cumsum(
         sometimes(0.5, 1e-5, 0.02) * jax.random.normal(next(keys), (cameras, 3)), axis=0
     )
@@ -324,7 +333,10 @@ def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
     which the best cost would be zero and a relative tolerance meaningless. The text does not say
     either how far off a start is (`PAPER_START`)."""
     keys = iter(jax.random.split(key, 10))
-    normal = lambda *shape: jax.random.normal(next(keys), shape)
+
+    def normal(*shape):
+        return jax.random.normal(next(keys), shape)
+
     world = jax.random.uniform(next(keys), (kind.points, 3), minval=-2.0, maxval=2.0)
     away = jax.random.uniform(next(keys), (kind.cameras, 1), minval=6.0, maxval=12.0)
     direction = normal(kind.cameras, 3)
@@ -348,6 +360,9 @@ def _assemble(
     """Observations in the order of the slots: camera by camera, the points of each, and an empty
     one at the end."""
     cameras, points = start
-    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, 1)])
+
+    def pad(x):
+        return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, 1)])
+
     mask = pad(seen).reshape(-1)
     return Scenes(cameras, pad(points.T), pad(pixels).reshape(2, -1) * mask, mask)

@@ -145,7 +145,9 @@ def _play(
     count = bank.initial_cost.shape[0]
 
     def fresh(scene: Int[Array, ""]) -> Carry:
-        at = lambda tree: jax.tree.map(lambda x: x[scene], tree)
+        def at(tree):
+            return jax.tree.map(lambda x: x[scene], tree)
+
         start = at(bank.scenes)
         state = LMState(start.cameras, start.points, at(bank.initial_cost))
         return begin(at(bank.info), policy, state)
@@ -159,7 +161,8 @@ def _play(
         return carry, (step, converged), converged | (carry.iteration >= limit)
 
     def note(found: Any, scene: Array, carry: Carry, record: Any, _: Array) -> Any:
-        (step, converged), iteration = record, carry.iteration
+        (step, converged) = record
+        iteration = carry.iteration
         return found._replace(
             costs=found.costs.at[scene, iteration - 1].set(step.cost, mode="drop"),
             dampings=found.dampings.at[scene, iteration - 1].set(step.damping, mode="drop"),

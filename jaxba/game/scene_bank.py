@@ -38,7 +38,8 @@ PORTFOLIO_ITERATIONS = 50  # largest number of linear solves of each rule
 # relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default
 PORTFOLIO_FTOL = 1e-7
 
-MIN_RATIO, MAX_RATIO = 1.01, 1e6
+MIN_RATIO = 1.01
+MAX_RATIO = 1e6
 """Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is
 between 1.04 and 1.1."""
 
@@ -73,7 +74,8 @@ def info_of(
 
     def one(scene: Scenes, cost: Array) -> ProblemInfo:
         grid = scene.mask.reshape(kind.cameras, kind.points + 1)
-        seen, points = jnp.any(grid, axis=1), jnp.sum(jnp.any(grid, axis=0))
+        seen = jnp.any(grid, axis=1)
+        points = jnp.sum(jnp.any(grid, axis=0))
         return ProblemInfo.of(cost, jnp.sum(grid), points, seen, scene.cameras[6], limit)
 
     return jax.vmap(one)(scenes, initial)
@@ -200,12 +202,17 @@ def make_split(
     with a line when something long begins. The game's tolerance does not change which are usable.
     Windows are cut from `problems`, in memory or files, instead of those that `config` names.
     Raises InputError: no scene would be left to train on."""
-    kind, count, key = config.kind, config.scenes, jax.random.fold_in(key, 0)
+    kind = config.kind
+    count = config.scenes
+    key = jax.random.fold_in(key, 0)
     where = _shape(kind)
-    on_rule = lambda rule: report(f"{count} scenes of {where}: {rule}")
-    solved = lambda scenes: solve_scenes(
-        kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance
-    )
+
+    def on_rule(rule):
+        return report(f"{count} scenes of {where}: {rule}")
+
+    def solved(scenes):
+        return solve_scenes(kind, scenes, options, limit, PORTFOLIO, on_rule, tolerance)
+
     if kind.family == "windows":
         seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
         banks = [
@@ -223,7 +230,9 @@ def make_split(
     return Split(*banks)
 
 
-HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
+HELD_OUT = 0.1
+ENOUGH = 200
+MOST_HELD_OUT = 1 / 3
 """Fraction of usable scenes held out; more up to a number whose mean says something, at most the
 last one."""
 

@@ -29,10 +29,8 @@ def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
 @functools.cache
 def _layout(kind: SceneClass, options: StepOptions) -> Layout:
     count = kind.cameras * kind.points
-    camera, point = (
-        np.tile(np.arange(kind.cameras), kind.points),
-        np.repeat(np.arange(kind.points), kind.cameras),
-    )
+    camera = np.tile(np.arange(kind.cameras), kind.points)
+    point = np.repeat(np.arange(kind.points), kind.cameras)
     cameras = np.zeros((kind.cameras, 9))
     problem = BundleProblem.create(
         cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point

@@ -9,6 +9,7 @@ keeps them constant."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,15 +48,21 @@ def read_windows(
     for number, problem in enumerate(read_all(problems)):
         rng = np.random.default_rng([seed, number])
         share = -(-count // len(problems))
-        linked, held = covisible(problem), round(HELD_OUT * share)
+        linked = covisible(problem)
+        held = round(HELD_OUT * share)
         for part, cameras, wanted in zip(parts, places(linked), (share - held, held), strict=True):
             if len(cameras) >= FEWEST_CAMERAS:
                 part.extend(window(problem, kind, linked, cameras, rng) for _ in range(wanted))
     # so that the first windows are of all problems
     shuffle = np.random.default_rng([seed, len(problems)]).permutation
     train, held_out = ([part[k] for k in shuffle(len(part))] for part in parts)
-    column = lambda part, name: jnp.asarray(np.stack([getattr(one, name) for one in part]))
-    stack = lambda part: Scenes(*(column(part, name) for name in Scenes._fields))
+
+    def column(part, name):
+        return jnp.asarray(np.stack([getattr(one, name) for one in part]))
+
+    def stack(part):
+        return Scenes(*(column(part, name) for name in Scenes._fields))
+
     return stack(train), stack(held_out)
 
 
@@ -66,7 +73,8 @@ def read_all(given: Sequence[StrPath | BundleProblem]) -> list[BundleProblem]:
     problems = []
     for number, path in enumerate(given):
         if isinstance(path, BundleProblem):
-            problem, path = path, f"problem {number}"
+            problem = path
+            path = f"problem {number}"
         else:
             problem = read_problem(path)
         if problem.whitening is not None:
@@ -130,7 +138,8 @@ def window(
     grid = grid[:, points]
     grid &= (grid.sum(axis=1) >= MIN_VIEWS)[:, None]
     grid &= (grid.sum(axis=0) >= 2)[None]
-    cameras, start = np.array(problem.cameras)[chosen], np.array(problem.points)[points]
+    cameras = np.array(problem.cameras)[chosen]
+    start = np.array(problem.points)[points]
     if rng.random() < MOVED:
         cameras, start = _moved(cameras, start, rng)
     more, rest = kind.cameras - len(chosen), kind.points + 1 - len(points)  # that are not observed
@@ -138,9 +147,13 @@ def window(
     whole_points = np.pad(start, ((0, rest), (0, 0)))
     whole_grid = np.pad(grid, ((0, more), (0, rest)))
     whole_pixels = np.pad(pixels[:, :, points] * grid, ((0, 0), (0, more), (0, rest)))
-    return Scenes(
-        whole_cameras.T, whole_points.T, whole_pixels.reshape(2, -1), whole_grid.reshape(-1)
-    )  # pyright: ignore[reportArgumentType]
+    arrays: Any = (
+        whole_cameras.T,
+        whole_points.T,
+        whole_pixels.reshape(2, -1),
+        whole_grid.reshape(-1),
+    )
+    return Scenes(*arrays)
 
 
 def _grid(
@@ -152,7 +165,8 @@ def _grid(
     place[chosen] = np.arange(len(chosen))
     row = place[np.asarray(problem.camera_index)]
     kept = row >= 0
-    row, column = row[kept], np.asarray(problem.point_index)[kept]
+    row = row[kept]
+    column = np.asarray(problem.point_index)[kept]
     grid = np.zeros((len(chosen), problem.num_points), bool)
     pixels = np.zeros((2, len(chosen), problem.num_points))
     grid[row, column] = True
@@ -165,8 +179,12 @@ def _moved(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cameras turned and shifted, and points moved along their distance, as at the start of random
     scenes."""
-    log_uniform = lambda limits: np.exp(rng.uniform(*np.log(limits)))
-    turned, centers = geometry.rotation_matrices(cameras[:, :3]), geometry.camera_centers(cameras)
+
+    def log_uniform(limits):
+        return np.exp(rng.uniform(*np.log(limits)))
+
+    turned = geometry.rotation_matrices(cameras[:, :3])
+    centers = geometry.camera_centers(cameras)
     step = np.linalg.norm(np.diff(centers, axis=0), axis=1).mean()
     centers = centers + log_uniform(START_CENTER) * step * rng.normal(size=centers.shape)
     noise = geometry.rotation_matrices(

@@ -106,12 +106,11 @@ def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:
 def _read(text: Text) -> BundleProblem:
     counts: list[int] = []
     ends = [3]
-    camera_index, point_index, pixels = (
-        np.empty(0, np.int32),
-        np.empty(0, np.int32),
-        np.empty((0, 2)),
-    )
-    cameras, points = np.empty((0, CAMERA_SIZE)), np.empty((0, POINT_SIZE))
+    camera_index = np.empty(0, np.int32)
+    point_index = np.empty(0, np.int32)
+    pixels = np.empty((0, 2))
+    cameras = np.empty((0, CAMERA_SIZE))
+    points = np.empty((0, POINT_SIZE))
     for block in text.number_blocks(partial(_field, ())):
         counts += text.integers(range(block.start, min(block.stop, 3)), 1, LARGEST_COUNT).tolist()
         if len(counts) < 3:

@@ -64,7 +64,8 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
     a camera that sees points has focal length 0, which stands for cameras that are not registered,
     lenses are not BAL's, or the file cannot be written."""
     valid = bal_only(problem, path)
-    cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)
+    cameras = np.asarray(valid.cameras)
+    camera_index = np.asarray(valid.camera_index)
     lost = np.flatnonzero(
         (cameras[:, 6] == 0) & (np.bincount(camera_index, minlength=len(cameras)) > 0)
     )
@@ -73,7 +74,8 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
         raise ProblemError(f"cannot write {display_name(path)}: {name} has focal length 0")
     order = np.argsort(valid.point_index, kind="stable")
     views = np.bincount(np.asarray(valid.point_index), minlength=valid.num_points).tolist()
-    keys, pixels = numbered(camera_index)[order].tolist(), valid.observations[order].tolist()
+    keys = numbered(camera_index)[order].tolist()
+    pixels = valid.observations[order].tolist()
     rows = zip(camera_index[order].tolist(), keys, pixels, strict=True)
     colour = " ".join(map(str, POINT_COLOUR))
     with open_output(path) as file:

@@ -51,7 +51,10 @@ def read_control_points(path: StrPath) -> ControlPoints:
         raise ProblemError(f"{file} line {number}: is no coordinate system, such as EPSG:32632")
     names: dict[str, int] = {}
     seen: set[tuple[int, str]] = set()
-    places, point, images, pixels = [], [], [], []
+    places = []
+    point = []
+    images = []
+    pixels = []
     for number, line in given:
         where = f"{file} line {number}"
         words = _words(line)

@@ -57,7 +57,8 @@ def parse(text: bytes, *, large: bool = True) -> tuple[Float[np.ndarray, " n"], 
     """The numbers of a text, which may be part of a large one, up to the first bad word, and what
     is wrong with that one, if any."""
     text = b"\n%b\n" % text
-    values, complaint = _parse_lines(text, large), None
+    values = _parse_lines(text, large)
+    complaint = None
     if values is None:
         values = _parse_lines(_PLUS.sub(b" ", text.translate(_FORTRAN_TO_C)), large)
     if values is None:  # one of the words is no number, or not finite: search it word by word
@@ -117,7 +118,8 @@ def _parse_lines(text: bytes, large: bool) -> Float[np.ndarray, " n"] | None:
     SciPy's reader takes the longest number that a line begins with, and drops the rest, and the
     sign of zero."""
     kinds = np.frombuffer(text.translate(_KIND_OF), np.uint8)
-    before, after = kinds[:-1], kinds[1:]
+    before = kinds[:-1]
+    after = kinds[1:]
     count = np.count_nonzero((before != _SPACE) & (after == _SPACE))
     if count and not large:
         with warnings.catch_warnings(), suppress(ValueError, DeprecationWarning):

@@ -64,7 +64,8 @@ def plain_text(data: bytes) -> bytes:
 
 
 def _plain(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    begin, held = b"", b""
+    begin = b""
+    held = b""
     while len(begin) < _LONGEST_MARK and (piece := next(pieces, None)) is not None:
         begin += piece
     mark = next((mark for mark in MARKS if begin.startswith(mark)), b"")

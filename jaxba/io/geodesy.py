@@ -18,7 +18,8 @@ from jaxtyping import Float
 from jaxba.io.notes import report
 from jaxba.problem.checks import shown
 
-GEODETIC, GEOCENTRIC = "EPSG:4979", "EPSG:4978"
+GEODETIC = "EPSG:4979"
+GEOCENTRIC = "EPSG:4978"
 """WGS 84 as longitude, latitude and height, and as metres from the centre of the earth."""
 
 SAME_UNIT = 1e-5
@@ -151,10 +152,8 @@ def _scales(source: Any, called: str, units: Sequence[float], where: str) -> Flo
     of a system without heights are metres. Notes in which unit heights are, where the file does not
     say it and it is no metre."""
     axes = source.axis_info
-    flat, up = (
-        (1.0 if source.is_geographic else axes[0].unit_conversion_factor),
-        axes[min(2, len(axes) - 1)],
-    )
+    flat = 1.0 if source.is_geographic else axes[0].unit_conversion_factor
+    up = axes[min(2, len(axes) - 1)]
     unit_of_system = up.unit_conversion_factor if len(axes) > 2 or not source.is_geographic else 1.0
     horizontal = units[0] / flat if np.isfinite(units[0]) and not source.is_geographic else 1.0
     if abs(horizontal - 1) < SAME_UNIT:

@@ -53,7 +53,8 @@ def from_plain(kind: type[T], data: Any, path: str = "") -> T:
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)
-    values, above = {}, f"{path}." if path else ""
+    values = {}
+    above = f"{path}." if path else ""
     for field in fields(kind):  # type: ignore[arg-type]
         key = key_of(field)
         if key not in data and field.default is not MISSING:
@@ -87,7 +88,8 @@ def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
     incomplete last one. Raises ProblemError: unreadable, or another malformed line; names file and
     line."""
     try:
-        lines, found = Path(path).read_bytes().split(b"\n"), []
+        lines = Path(path).read_bytes().split(b"\n")
+        found = []
     except OSError as error:
         raise ProblemError(f"{path}: {error.strerror or error}") from None
     for number, line in enumerate(lines, start=1):

@@ -75,7 +75,9 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
 
     cameras = dict(document.get("cameras").entries("camera"))
     lenses: dict[str, Lens] = {}  # of the cameras that shots name
-    shots, rotations, translations = {}, [], []
+    shots = {}
+    rotations = []
+    translations = []
     for key, shot in document.get("shots").entries("shot"):
         camera = shot.get("camera").text()
         if camera not in cameras:
@@ -166,10 +168,12 @@ def _read_tracks(
     holds."""
     name = display_name(path)
     lines = read_characters(path).split("\n")
-    version, first = 0, 0
+    version = 0
+    first = 0
     if lines[0].startswith(TRACKS_HEADER):
         stated = lines[0].removeprefix(TRACKS_HEADER).strip()
-        version, first = int(stated) if stated in ("1", "2") else -1, 1
+        version = int(stated) if stated in ("1", "2") else -1
+        first = 1
         if version < 0:
             raise ProblemError(
                 f"{name} line 1: version {stated!a} of tracks is not read; 1 and 2 are"

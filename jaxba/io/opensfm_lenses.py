@@ -63,12 +63,17 @@ def lens(camera: Record) -> Lens:
         camera.fail(
             f"has projection_type {model!a}, which is not read; read are {', '.join(MODELS)}"
         )
-    width, height = camera.get("width").number(), camera.get("height").number()
+    width = camera.get("width").number()
+    height = camera.get("height").number()
     if not min(width, height) > 0:
         camera.fail("has no width and height, so that nothing can be in pixels")
     side = max(width, height)
-    optional = lambda key: camera.get(key, 0.0).number()
-    count, radial = _RADIAL.get(model, 2), model in _RADIAL
+
+    def optional(key):
+        return camera.get(key, 0.0).number()
+
+    count = _RADIAL.get(model, 2)
+    radial = model in _RADIAL
     fx, fy = (
         side * camera.get(key).number()
         for key in (("focal_x", "focal_y") if radial else ("focal", "focal"))
@@ -113,12 +118,14 @@ def assemble(
     intrinsics = np.zeros((len(lenses), max(map(len, models))))
     free = np.zeros(intrinsics.shape, bool)
     for at, (one, model) in enumerate(zip(lenses, names, strict=True)):
-        (fx, fy), (cx, cy) = one.focal, one.center
+        (fx, fy) = one.focal
+        (cx, cy) = one.center
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **one.distortion}
         moves = {"f", "fx", "fy", *({"k1", "k2"} & set(one.distortion))} if one.is_bal else set()
         for place, parameter in enumerate(CAMERA_MODELS[model].parameters):
             intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), parameter in moves
-    observations, covariance = pixels, None
+    observations = pixels
+    covariance = None
     if bal:
         focal, centers = (
             np.array([getattr(one, name) for one in lenses]) for name in ("focal", "center")

@@ -121,7 +121,9 @@ def read_table(path: StrPath, crs_is_geographic: bool | None = None) -> Position
     if missing := [axis for axis in ("name", *axes) if axis not in column]:
         raise ProblemError(f"{file} line {max(layout.first, 1)}: there is no column {missing[0]}")
     known = [what for what in KINDS if what in column]
-    names, places, given = [], [], []
+    names = []
+    places = []
+    given = []
     for number, line in enumerate(lines[layout.first :], layout.first + 1):
         cells = _row(line, layout)
         if line.lstrip().startswith("#") or not any(cells):

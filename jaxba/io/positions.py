@@ -22,7 +22,9 @@ from jaxba.io.position_tables import WGS84, Positions, read_table
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
 
-GPS, ABOVE_SEA, ACCURACY = 0x8825, 5, 31
+GPS = 0x8825
+ABOVE_SEA = 5
+ACCURACY = 31
 """Block of the EXIF data of a photo with its position, and its fields: 1 below sea level, and
 GPSHPositioningError, the horizontal accuracy in metres. Source: CIPA DC-008 (EXIF 2.32), section
 4.6.6."""
@@ -41,10 +43,8 @@ def read_database(path: StrPath) -> Positions:
     """Reads the positions of COLMAP's database. Source: COLMAP 4.2, `pose_priors` in
     database_sqlite.cc; before 4.0 the table has the image instead of sensor and data. Raises
     ProblemError: it is none, or has no positions; one line."""
-    file, rows = (
-        display_name(path),
-        _pose_priors(path, "position", "position_covariance", "coordinate_system"),
-    )
+    file = display_name(path)
+    rows = _pose_priors(path, "position", "position_covariance", "coordinate_system")
     places = np.array([_numbers(row[1], 3) for row in rows]).reshape(-1, 3)
     kept = np.flatnonzero(np.isfinite(places).all(axis=1))
     systems = {rows[at][3] for at in kept}
@@ -140,7 +140,9 @@ def read_photos(folder: StrPath, names: Iterable[str]) -> Positions:
     """Reads the GPS position of each photo of a folder that has one, by the names of images, which
     photos may have in another case or with another ending. Raises ProblemError: none has; one
     line."""
-    found, places, accuracies = [], [], []
+    found = []
+    places = []
+    accuracies = []
     names = list(names)
     for name, file in zip(names, files_of_images(folder, names), strict=True):
         place = None if file is None else _place_of(file)

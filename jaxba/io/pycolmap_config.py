@@ -45,7 +45,8 @@ def chosen_part(reconstruction: Any, config: Any, options: Any) -> BundleProblem
         assembled = _assembled(model, options)
     except NothingObserved:
         raise NothingObserved(f"{NAME}: no observation is left of what the config means") from None
-    problem, labels = assembled.problem, assembled.problem.labels
+    problem = assembled.problem
+    labels = assembled.problem.labels
     assert labels is not None
     whole = np.isin(labels.points, np.array(points, labels.points.dtype))
     problem = part(problem, images=np.isin(labels.images, images), points=whole)

@@ -58,7 +58,9 @@ class Text:
         # what the number at an ordinal is; may be replaced while reading
         self.field: Callable[[int], str]
         # what follows, and where in it the next line begins
-        self._pieces, self._text, self._at = iter(pieces), b"", 0
+        self._pieces = iter(pieces)
+        self._text = b""
+        self._at = 0
         # those kept: ordinal of the first number, lines before, text
         self._blocks: list[tuple[int, int, bytes]] = []
         # ordinals of the first number that is kept, and of the next one to read
@@ -81,17 +83,21 @@ class Text:
             if self._at >= len(self._text):
                 break
             end = end if end >= 0 else len(self._text)
-            line, self._at = self._text[self._at : end].strip(), end + 1
+            line = self._text[self._at : end].strip()
+            self._at = end + 1
             self.line += 1
         return line
 
     def read_numbers(self, field: Callable[[int], str]) -> np.ndarray:
         """Parses all that follows the lines that were read; returns `values`."""
-        parts, blocks = [np.empty(0)], []
+        parts = [np.empty(0)]
+        blocks = []
         for _ in self.number_blocks(field):
             parts.append(self.values)
             blocks += self._blocks
-        self.values, self._blocks, self._start = np.concatenate(parts), blocks, 0
+        self.values = np.concatenate(parts)
+        self._blocks = blocks
+        self._start = 0
         return self.values
 
     def number_blocks(self, field: Callable[[int], str]) -> Iterator[range]:
@@ -104,7 +110,8 @@ class Text:
                 pass
             last = space is None
             end = space.end() if space else len(self._text)
-            text, self._at = self._text[self._at : end], end
+            text = self._text[self._at : end]
+            self._at = end
             self._blocks, self._start = [(self._count, lines, text)], self._count
             self.values, self._complaint = parse(text, large=self._count > 16 * SMALL)
             if self.values.size:
@@ -168,13 +175,15 @@ class Text:
 
     def _more(self) -> bool:
         """Takes a block more of the text; False at its end."""
-        parts, size = [self._text[self._at :]], 0
+        parts = [self._text[self._at :]]
+        size = 0
         for piece in self._pieces:
             parts.append(piece)
             size += len(piece)
             if size >= BLOCK_BYTES:
                 break
-        self._text, self._at = b"".join(parts), 0
+        self._text = b"".join(parts)
+        self._at = 0
         return size > 0
 
 
@@ -190,7 +199,10 @@ def read_tracks(
     (count, 3); of each view camera, point and pixel (views, 2); the position after the last number.
     Raises ProblemError: the file ends early, or something is no number or out of range; or there
     are no views."""
-    values, before, starts, end = text.values, text.field, [], start
+    values = text.values
+    before = text.field
+    starts = []
+    end = start
 
     def field(ordinal: int) -> str:
         point = bisect_right(starts, ordinal) - 1

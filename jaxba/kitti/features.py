@@ -48,7 +48,8 @@ def match(
     squared = np.maximum(
         (first**2).sum(1)[:, None] + (second**2).sum(1) - 2 * (first @ second.T), 0
     )
-    there, back = _nearest(squared), _nearest(squared.T)
+    there = _nearest(squared)
+    back = _nearest(squared.T)
     rows = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(first))))
     return np.stack([rows, there[rows]], axis=1)
 

@@ -39,7 +39,8 @@ def build(
     numbers = tuple(sequence.numbers[i] for i in linked)
     chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)
     frames = tuple(numbers[i] for i in chosen)
-    tracks, restarts = every.restrict(chosen), ()
+    tracks = every.restrict(chosen)
+    restarts = ()
     if options.start == "vo":
         report(f"visual odometry ({len(frames)})")
         views, restarts = visual_odometry(
@@ -69,7 +70,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
     The images of the tracks are positions among them. A frame not linked with one of the `reach`
     before it is left out. Raises ProblemError: an image cannot be read, or too many frames in a row
     are not linked: the message names them."""
-    read, calibration = image_reader(sequence), sequence.calibration
+    read = image_reader(sequence)
+    calibration = sequence.calibration
     # descriptors of a whole sequence would fill gigabytes
     recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)
     pixels: list[np.ndarray] = []
@@ -85,7 +87,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
                 calibration.rays(pixels[k][own]) for k, own in ((i, pairs[:, 0]), (j, pairs[:, 1]))
             )
             matches[i, j] = pairs[essential(first, second, EPIPOLAR_PIXELS / calibration.fx)[1]]
-    linked, before = [0], [0]
+    linked = [0]
+    before = [0]
     for j in range(1, len(sequence)):
         before = [i for i in linked if j - i <= options.reach]
         if any(len(matches[i, j]) >= options.min_matches for i in before):
@@ -93,7 +96,8 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         elif not before:
             break
     if len(linked) < 2 or not before:
-        number, last = sequence.numbers, linked[-1]
+        number = sequence.numbers
+        last = linked[-1]
         counts = sorted((k, len(found)) for (i, k), found in matches.items() if i == last)
         shares = ", ".join(f"{count} with frame {number[k]}" for k, count in counts)
         raise ProblemError(

@@ -122,11 +122,13 @@ class _Scene:
         matrix, inliers = essential(a, b, EPIPOLAR_PIXELS / self.focal)
         if matrix is None or inliers.sum() < MIN_POINTS:
             return None
-        a, b = np.ascontiguousarray(a[inliers]), np.ascontiguousarray(b[inliers])
+        a = np.ascontiguousarray(a[inliers])
+        b = np.ascontiguousarray(b[inliers])
         _, rotation, translation, front, _ = cv2.recoverPose(
             matrix, a, b, np.eye(3), distanceThresh=FARTHEST
         )
-        front, rotation = np.asarray(front).ravel() > 0, np.asarray(rotation)
+        front = np.asarray(front).ravel() > 0
+        rotation = np.asarray(rotation)
         if front.sum() < MIN_POINTS:
             return None
         ahead, turned = (
@@ -215,7 +217,8 @@ def _resect(scene: _Scene, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     near = scene.neighbour(view)
     # in the frame of the neighbour, where coordinates are small and rounding errors too
     points = scene.views.local(np.full(len(rows), near), scene.points[scene.tracks.track[rows]])
-    rays, pinhole = np.ascontiguousarray(scene.observations.rays[rows]), (np.eye(3), np.zeros(4))
+    rays = np.ascontiguousarray(scene.observations.rays[rows])
+    pinhole = (np.eye(3), np.zeros(4))
     ok, turn, shift, inliers = cv2.solvePnPRansac(
         points,
         rays,
@@ -250,7 +253,8 @@ def _pose_from_neighbour(
         )
     known = np.flatnonzero(np.isfinite(scene.points[tracks, 0]))
     views = Views(np.stack([np.eye(3), found.rotation]), np.stack([np.zeros(3), found.translation]))
-    rays, count = np.stack([a, b], axis=1)[known].reshape(-1, 2), np.arange(len(known))
+    rays = np.stack([a, b], axis=1)[known].reshape(-1, 2)
+    count = np.arange(len(known))
     seen = Observations(np.tile([0, 1], len(known)), np.repeat(count, 2), rays)
     two = triangulate(views, seen)
     good = two.good(seen.track, 0.0, scene.options.max_error / scene.focal)

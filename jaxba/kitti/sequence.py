@@ -39,11 +39,13 @@ def read_calibration(path: StrPath, camera: int = 0) -> Calibration:
     if place.is_dir():
         place = next((one for one in calibration_files(place) if one.is_file()), None)
     if place is None:
-        name, known = display_name(path), " or ".join(FILES)
+        name = display_name(path)
+        known = " or ".join(FILES)
         raise ProblemError(f"{name}: has no calibration ({known}); --calibration names another")
     name = display_name(place)
     matrix = _matrix([line for _, line in lines_of(place)], name, camera)
-    fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
+    fx = float(matrix[0, 0])
+    fy = float(matrix[1, 1])
     zeros = matrix[[0, 1, 2, 2], [1, 0, 0, 1]]
     if not (fx > 0 and fy > 0 and matrix[2, 2] == 1 and not zeros.any()):
         raise ProblemError(
@@ -103,7 +105,8 @@ def read_sequence(
     included, as a Python slice. Cameras 0 and 1 are KITTI's grey ones, 2 and 3 the coloured ones;
     `calibration` is the file of the camera matrix, if it is not that of the folder. Raises
     ProblemError: no folder, images or calibration, or a range outside the sequence."""
-    root, name = Path(folder), display_name(folder)
+    root = Path(folder)
+    name = display_name(folder)
     if not root.is_dir():
         raise ProblemError(f"{name}: no such folder")
     images = root / f"image_{camera}"

@@ -56,14 +56,17 @@ class Tracks:
     def shared(self, a: int, b: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
         """Rows of the tracks that both images see: those in image a, those in image b, in the same
         order."""
-        rows_a, rows_b = self.rows_of_image(a), self.rows_of_image(b)
+        rows_a = self.rows_of_image(a)
+        rows_b = self.rows_of_image(b)
         _, at_a, at_b = np.intersect1d(self.track[rows_a], self.track[rows_b], return_indices=True)
         return rows_a[at_a], rows_b[at_b]
 
     def keep(self, rows: np.ndarray) -> Tracks:
         """The observations that a mask selects, of tracks that then still have two; tracks are
         renumbered."""
-        image, track, pixels = self.image[rows], self.track[rows], self.pixels[rows]
+        image = self.image[rows]
+        track = self.track[rows]
+        pixels = self.pixels[rows]
         long = np.bincount(track, minlength=self.count)[track] >= 2
         return Tracks(image[long], np.unique(track[long], return_inverse=True)[1], pixels[long])
 

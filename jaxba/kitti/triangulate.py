@@ -74,8 +74,12 @@ def triangulate(views: Views, observations: Observations) -> Triangulated:
     by Gauss-Newton."""
     camera, track, rays = observations
     starts = np.flatnonzero(np.diff(track, prepend=-1))
-    total = lambda values: np.add.reduceat(values, starts, axis=0)
-    rotation, centers = views.rotation[camera], views.centers()[camera]
+
+    def total(values):
+        return np.add.reduceat(values, starts, axis=0)
+
+    rotation = views.rotation[camera]
+    centers = views.centers()[camera]
     origin = centers[starts]  # of the points in the following, so that few digits are lost
     baseline = centers - origin[track]
     shift = -np.einsum("nij,nj->ni", rotation, baseline)
@@ -125,7 +129,8 @@ def triangulate_robustly(
     A point needs `min_views` errors of at most `error` focal lengths, and two rays `angle` degrees
     apart."""
     first = triangulate(views, observations)
-    points, keep = first.points, (first.error <= error) & (first.depth > 0)
+    points = first.points
+    keep = (first.error <= error) & (first.depth > 0)
     keep &= (
         np.bincount(observations.track[keep], minlength=len(points))[observations.track]
         >= min_views

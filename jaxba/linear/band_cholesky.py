@@ -74,7 +74,8 @@ def band_factor(band: Band, blocks: Float[Array, "blocks width width"]) -> BandF
     rows = band_rows(band, blocks)
     _, size, columns = rows.shape
     # tiles in the window, rows below its first tile
-    window_tiles, rest = columns // size, columns - size
+    window_tiles = columns // size
+    rest = columns - size
     window = jnp.zeros((columns, columns), rows.dtype)
     for k in range(window_tiles):  # row k of the window ends on the diagonal
         window = window.at[k * size : (k + 1) * size, : (k + 1) * size].set(

@@ -43,13 +43,17 @@ def bordered(
     `product` is that with S, `inner` is `A^-1`, for `without_lenses` of S, and `like` has the shape
     and type of a right-hand side. `store`: whether `A^-1 B` is stored for several right-hand sides,
     and not computed along with the only one."""
-    lenses, numbers = unknowns.lenses, len(unknowns.columns)
+    lenses = unknowns.lenses
+    numbers = len(unknowns.columns)
     if not lenses.several:
         return inner
     members = jnp.asarray(lenses.members).astype(like.dtype)
     # one column of T_L for one camera
     unit = jnp.eye(numbers, like.shape[1], POSE_SIZE, dtype=like.dtype)
-    columns_of = lambda member: jax.vmap(lambda row: product(member[:, None] * row))(unit)
+
+    def columns_of(member):
+        return jax.vmap(lambda row: product(member[:, None] * row))(unit)
+
     whole = lax.map(columns_of, members.T)  # [lenses, numbers, cameras, width]
     whole = whole.reshape(-1, *like.shape).transpose(1, 2, 0)
     corner = jnp.einsum("cl,ckm->lkm", members, whole[:, POSE_SIZE:], precision="highest").reshape(
@@ -72,8 +76,12 @@ def bordered(
         found = inner(
             jnp.concatenate([kept(right)[:, :, None], *([] if store else [columns])], axis=2)
         )
-        own, solved = found[:, :, 0], jnp.concatenate([found[:, :, 1:], *stored], axis=2)
-        times = lambda x: jnp.einsum("cam,ca...->m...", columns, x, precision="highest")
+        own = found[:, :, 0]
+        solved = jnp.concatenate([found[:, :, 1:], *stored], axis=2)
+
+        def times(x):
+            return jnp.einsum("cam,ca...->m...", columns, x, precision="highest")
+
         sums = lenses.total(right[:, POSE_SIZE:])
         rest = sums.at[lenses.owners].get(mode="fill", fill_value=0).reshape(-1) - times(own)
         lens = factor_and_solve(corner - times(solved), rest)

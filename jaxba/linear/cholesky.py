@@ -64,7 +64,10 @@ def _lower_cholesky_jvp(matrix: tuple[Array], change: tuple[Array]) -> tuple[Arr
     """JAX's own rule takes the tangent for symmetric, and would be wrong where only its lower
     triangle is filled."""
     full = jnp.tril(change[0]) + jnp.tril(change[0], -1).mT
-    factored = lambda a: jnp.linalg.cholesky(a, symmetrize_input=False)
+
+    def factored(a):
+        return jnp.linalg.cholesky(a, symmetrize_input=False)
+
     return jax.jvp(factored, matrix, (full,))
 
 
@@ -79,7 +82,10 @@ def factor_and_solve(
     rows = scale if right.ndim == 1 else scale[:, None]
     if matrix.shape[0] < MIN_UNKNOWNS:
         return _lapack_solve(scaled, right * rows) * rows
-    by_panels = lambda a, b: factor_panels(a).solve(b)
+
+    def by_panels(a, b):
+        return factor_panels(a).solve(b)
+
     return lax.platform_dependent(scaled, right * rows, cpu=by_panels, default=_lapack_solve) * rows
 
 
@@ -95,7 +101,8 @@ def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Pane
     columns of a panel; `PANEL` if None."""
     n = matrix.shape[0]
     width = max(least or PANEL, -(-n // MAX_PANELS))
-    inverses, belows = [], []
+    inverses = []
+    belows = []
     for number, start in enumerate(range(0, n, width)):
         size = min(width, n - start)
         panel = matrix[start:, start : start + size]

@@ -39,23 +39,27 @@ def factored(system: DampedSystem, *, rough: bool = False) -> Solve:
     """`T (T^T S T)^-1 T^T`; non-finite if S is not positive definite. The system is B + D_c and
     what is eliminated. `rough` is for a preconditioner in float32: the diagonal is scaled to one
     and shifted, so that the factor exists."""
-    layout, unknowns = system.layout, system.layout.unknowns
+    layout = system.layout
+    unknowns = system.layout.unknowns
     if _by_woodbury(layout):
         wide = dense_coupling(system)
         return lambda right: capacitance_solve(wide, system.cameras.blocks, right)
     if layout.grid is not None:
         return _merged(unknowns, dense_system(system), rough)
-    pairs, blocks = layout.part("pairs"), reduced_blocks(system)
+    pairs = layout.part("pairs")
+    blocks = reduced_blocks(system)
     if unknowns.merged:
         return _merged(unknowns, dense_blocks(pairs, blocks), rough)
     kept = without_lenses(unknowns, pairs, blocks)
     if pairs.band is None:
-        solve = _dense(dense_blocks(pairs, kept), rough)
-        inner = lambda x: solve(x.reshape(-1, *x.shape[2:])).reshape(x.shape)
+        solve_by_camera = _of_camera_rows(_dense(dense_blocks(pairs, kept), rough))
     else:
-        inner = _banded(pairs, pairs.band, kept, rough)
-    product = lambda x: apply_reduced(system, x)
-    return bordered(unknowns, product, inner, system.cameras.right, store=rough)
+        solve_by_camera = _banded(pairs, pairs.band, kept, rough)
+
+    def product(x):
+        return apply_reduced(system, x)
+
+    return bordered(unknowns, product, solve_by_camera, system.cameras.right, store=rough)
 
 
 def _by_woodbury(layout: Layout) -> bool:
@@ -80,8 +84,16 @@ def _dense(matrix: Float[Array, "n n"], rough: bool) -> Solve:
     panels = factor_panels(
         matrix * scale[:, None] * scale + _shift(matrix) * jnp.eye(len(matrix), dtype=matrix.dtype)
     )
-    times = lambda x: (scale if x.ndim == 1 else scale[:, None]) * x
+
+    def times(x):
+        return (scale if x.ndim == 1 else scale[:, None]) * x
+
     return lambda x: times(panels.solve(times(x)))
+
+
+def _of_camera_rows(solve: Solve) -> Solve:
+    """Solves for [cameras, width, ...] by a solver for [cameras * width, ...]."""
+    return lambda right: solve(right.reshape(-1, *right.shape[2:])).reshape(right.shape)
 
 
 def _banded(
@@ -99,11 +111,19 @@ def _banded(
         blocks = blocks * sides[0] * sides[1] + _shift(blocks) * own * jnp.eye(
             blocks.shape[-1], dtype=blocks.dtype
         )
-        factor = band_factor(band, blocks)
-        one = lambda x: scale * factor.solve(scale * x)
     else:
-        one = band_factor(band, blocks).solve
-    return lambda x: one(x) if x.ndim == 2 else jax.vmap(one, in_axes=2, out_axes=2)(x)
+        scale = 1.0
+    factor = band_factor(band, blocks)
+
+    def solve_column(right):
+        return scale * factor.solve(scale * right) if rough else factor.solve(right)
+
+    def solve(right):
+        if right.ndim == 2:
+            return solve_column(right)
+        return jax.vmap(solve_column, in_axes=2, out_axes=2)(right)
+
+    return solve
 
 
 def _shift(matrix: Array) -> float:

@@ -19,8 +19,10 @@ from jaxba.structure.segment_sums import outer_sum, prefix_sum, take_rows, tree_
 
 def reduced_blocks(system: DampedSystem) -> Float[Array, "blocks width width"]:
     """The blocks of the lower triangle of S, in the order of `PairLayout`; the last one is zero."""
-    layout, blocks = system.layout, system.cameras.blocks
-    pairs, width = layout.part("pairs"), blocks.shape[-1]
+    layout = system.layout
+    blocks = system.cameras.blocks
+    pairs = layout.part("pairs")
+    width = blocks.shape[-1]
     products = sum_over_devices(layout, pair_products(pairs, coupling_by_camera(system), width))
 
     def subtracted(own: Array, products: Array) -> Array:
@@ -52,7 +54,8 @@ def dense_coupling(system: DampedSystem) -> Float[Array, "unknowns columns"]:
 
 def dense_system(system: DampedSystem) -> Float[Array, "unknowns unknowns"]:
     """`S = B + D_c - W W^T` as one dense matrix product."""
-    layout, wide = system.layout, dense_coupling(system)
+    layout = system.layout
+    wide = dense_coupling(system)
     product = sum_over_devices(layout, jnp.matmul(wide, wide.T, precision="highest"))
     unit = jnp.eye(layout.num_cameras, dtype=product.dtype)
     own = system.cameras.blocks[:, :, None, :] * unit[:, None, :, None]
@@ -91,6 +94,7 @@ def dense_blocks(
 ) -> Float[Array, "n n"]:
     """The blocks assembled into one matrix, of which only the lower triangle is filled."""
     assert pairs.table is not None
-    side, width = pairs.table.shape[0], blocks.shape[-1]
+    side = pairs.table.shape[0]
+    width = blocks.shape[-1]
     dense = take_rows(blocks.reshape(-1, width**2), pairs.table).reshape(side, side, width, width)
     return dense.transpose(0, 2, 1, 3).reshape(width * side, width * side)

@@ -68,8 +68,12 @@ def diagonal_blocks(system: DampedSystem) -> Float[Array, "cameras width width"]
     J_c`, two an observation, which stays positive semi-definite under rounding. If a camera sees a
     point twice, the product of the two observations is missing, which is harmless in a
     preconditioner."""
-    layout, (over, under) = system.layout, system.points.projected
-    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    layout = system.layout
+    (over, under) = system.points.projected
+
+    def dot(a, b):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
     f00 = safe_sqrt(jnp.maximum(1 - dot(over, over), 0))
     f10 = -dot(over, under) / jnp.where(f00 > 0, f00, 1)
     f11 = safe_sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))

@@ -38,7 +38,8 @@ def solve_reduced(
     """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the
     options name. Returns the step and the number of iterations (0 for a factorisation). The step is
     non-finite if a factorisation failed."""
-    right, mixed = system.cameras.right, options.mixed_precision
+    right = system.cameras.right
+    mixed = options.mixed_precision
     single = system
     if mixed:
         parts = {name: getattr(system, name) for name in _IN_SINGLE}
@@ -46,17 +47,27 @@ def solve_reduced(
             **jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), parts)
         )
     if options.linear_solver != "explicit":
-        blocks, apply = None, lambda x: apply_reduced(single, x)
+        blocks = None
+
+        def apply(x):
+            return apply_reduced(single, x)
+
         if options.linear_solver == "sparse":
             formed = blocks = reduced_blocks(single)
-            apply = lambda x: apply_blocks(single.layout, formed, x)
+
+            def apply(x):
+                return apply_blocks(single.layout, formed, x)
+
         inverse = preconditioner(single, blocks, options.conjugate_gradients.preconditioner)
         step, iterations = _conjugate_gradients(single, apply, inverse, options)
         return step.astype(right.dtype), iterations
     if not mixed or in_full(system.layout):
         return factored(system)(right), jnp.zeros((), jnp.int32)
     solve = factored(single, rough=True)
-    precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
+
+    def precondition(r):
+        return solve(r.astype(jnp.float32)).astype(r.dtype)
+
     corrected = system._replace(forcing=CORRECTION_FORCING)
     return _conjugate_gradients(
         corrected, lambda x: apply_reduced(system, x), precondition, options
@@ -70,12 +81,16 @@ def _conjugate_gradients(
     options: StepOptions,
 ) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     """On the range of T (structure/unknowns.py)."""
-    project, rule = system.layout.unknowns.project, options.conjugate_gradients
-    apply, precondition, right = (
-        lambda x: project(product(x)),
-        lambda r: project(inverse(r)),
-        system.cameras.right,
-    )
+    project = system.layout.unknowns.project
+    rule = options.conjugate_gradients
+
+    def apply(x):
+        return project(product(x))
+
+    def precondition(r):
+        return project(inverse(r))
+
+    right = system.cameras.right
     if options.linear_solver == "cg":
         # it returns no count; below the rounding error its iterations would end as 0 / 0
         least = float(jnp.finfo(right.dtype).eps)

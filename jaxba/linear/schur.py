@@ -61,7 +61,10 @@ def rotation_coordinates(
     if options.coordinates.rotation == "manifold":
         one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
         return one, one
-    to_front = lambda m: jnp.moveaxis(m, -1, 0)
+
+    def to_front(m):
+        return jnp.moveaxis(m, -1, 0)
+
     return to_front(left_jacobian(cameras[:3])), to_front(left_jacobian_inverse(cameras[:3]))
 
 
@@ -126,7 +129,8 @@ def eliminate_points(
     sums = point_sums(layout, normal_entries(linear.point_jacobian, linear.residual))
 
     def factored(sums: list[Array], damping: Array) -> list[Array]:
-        matrix, gradient = sums[:6], sums[6:]
+        matrix = sums[:6]
+        gradient = sums[6:]
         diagonal = [damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
         for entry, extra in zip((0, 2, 5), diagonal, strict=True):
             matrix[entry] = matrix[entry] + extra
@@ -136,7 +140,9 @@ def eliminate_points(
     entries = kept(
         layout, compute_in_one_loop(factored, sums, jnp.broadcast_to(damping, sums[0].shape))
     )
-    factor, solved, diagonal = Cholesky3(*entries[:6]), entries[6:9], entries[9:]
+    factor = Cholesky3(*entries[:6])
+    solved = entries[6:9]
+    diagonal = entries[9:]
     at_slot = take(jnp.stack(factor), layout.slot_point)
 
     def projected(factor: Array, jacobian: list[list[Array]]) -> list[Array]:
@@ -164,16 +170,15 @@ def camera_system(
         reduced = linear.residual[k] - sum(points.projected[k][i] * solved[i] for i in range(3))
         rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
     level, *levels = layout.camera_levels
-    width, (forward, inverse) = len(linear.camera_jacobian[0]), coordinates
+    width = len(linear.camera_jacobian[0])
+    (forward, inverse) = coordinates
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
     products = sum_over_devices(
         layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
     )
-    blocks, gradient, right = (
-        products[:, :, :width],
-        products[:, :, width],
-        -products[:, :, width + 1],
-    )
+    blocks = products[:, :, :width]
+    gradient = products[:, :, width]
+    right = -products[:, :, width + 1]
     rotation = jnp.einsum("cji,cjk,ckl->cil", forward, blocks[:, :3, :3], forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]],
@@ -192,7 +197,8 @@ def camera_system(
 
 def back_substitute(system: DampedSystem, step: Float[Array, "cameras width"]) -> list[Array]:
     """Point step `-L^-T (h + sum Y^T d_c)` of a camera step on the manifold, [3] of (points,)."""
-    points, inner = system.points, project_to_points(system, step)
+    points = system.points
+    inner = project_to_points(system, step)
     return [
         -x
         for x in points.factor.backward([h + w for h, w in zip(points.solved, inner, strict=True)])
@@ -274,12 +280,13 @@ def jacobian_product(
     points: Float[Array, "3 points"],
 ) -> list[Array]:
     """`J d` of every slot for a step on the manifold, [2] of (slots,), pixels."""
-    by_camera, by_point = (
-        take_each(cameras.T, layout.slot_camera),
-        take_each(points, layout.slot_point),
-    )
+    by_camera = take_each(cameras.T, layout.slot_camera)
+    by_point = take_each(points, layout.slot_point)
     rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
-    dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
+
+    def dot(a, b):
+        return functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
+
     return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]
 
 

@@ -56,7 +56,10 @@ def camera_modes(
     minus_rotation = -jnp.moveaxis(rotation_matrix(cameras[:3]), -1, 0)
     count = minus_rotation.shape[0]
     numbers = width - POSE_SIZE
-    zeros = lambda *shape: jnp.zeros((count, *shape), minus_rotation.dtype)
+
+    def zeros(*shape):
+        return jnp.zeros((count, *shape), minus_rotation.dtype)
+
     rotation = jnp.concatenate([minus_rotation, zeros(3, 4 + numbers)], axis=2)
     translation = jnp.concatenate(
         [zeros(3, 3), minus_rotation, cameras[3:6].T[:, :, None], zeros(3, numbers)], axis=2
@@ -97,8 +100,10 @@ def coarse_system(
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of
     clusters."""
-    clusters, count = system.layout.part("clusters"), modes.shape[-1]
-    layout, unknowns = system.layout, system.layout.unknowns
+    clusters = system.layout.part("clusters")
+    count = modes.shape[-1]
+    layout = system.layout
+    unknowns = system.layout.unknowns
     # whether a similarity of cameras and points changes no residual, cluster by cluster
     similar = unknowns.free.everywhere and not unknowns.in_rigs and not layout.residuals
     coupling = _similar_rows(system) if similar else _coupling_rows(system, modes)
@@ -136,9 +141,11 @@ def _coupling_rows(
 def _similar_rows(system: DampedSystem) -> Float[Array, "coarse rows"]:
     """The same where modes change no residual, `J_c P = -J_p [a x X, b, s X]`. The observations
     have the point X in common, so that only `J_p^T Q` and the columns of the lenses are summed."""
-    clusters, linear = system.layout.part("clusters"), system.linear
+    clusters = system.layout.part("clusters")
+    linear = system.linear
     over, under = system.points.projected
-    (first, second), (high, low) = linear.point_jacobian, linear.camera_jacobian
+    (first, second) = linear.point_jacobian
+    (high, low) = linear.camera_jacobian
     moved = [[first[k] * over[i] + second[k] * under[i] for k in range(3)] for i in range(3)]
     numbers = range(POSE_SIZE, len(high))
     lens = [[high[k] * over[i] + low[k] * under[i] for k in numbers] for i in range(3)]

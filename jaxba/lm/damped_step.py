@@ -82,7 +82,8 @@ def _slope_and_damping(
 
     `d.e` is zero for a factorisation, and for conjugate gradients from zero. The other two terms
     are positive."""
-    points, cameras = system.points, system.cameras
+    points = system.points
+    cameras = system.cameras
     of_points = (
         jnp.sum(jnp.stack(points.gradient) * point_step),
         jnp.sum(jnp.stack(points.damping) * point_step**2),
@@ -95,7 +96,10 @@ def _slope_and_damping(
 def largest_diagonal(layout: Layout, linear: Linearization) -> Float[Array, ""]:
     """Largest diagonal entry of the undamped `H = J^T J`. Source: the unit of g2o's initial
     lambda."""
-    square = lambda rows: [a * a + b * b for a, b in zip(*rows, strict=True)]
+
+    def square(rows):
+        return [a * a + b * b for a, b in zip(*rows, strict=True)]
+
     by_camera = sum_over_devices(
         layout, tree_sum(as_rows(square(linear.camera_jacobian)), layout.camera_levels)
     )

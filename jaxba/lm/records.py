@@ -82,9 +82,10 @@ class StepInfo(NamedTuple):
     @classmethod
     def stacked(cls, steps: Sequence[StepInfo]) -> StepInfo:
         """The records of several iterations as one, of NumPy arrays."""
-        column = lambda name: np.array(
-            [getattr(step, name) for step in steps], KINDS.get(name, float)
-        )
+
+        def column(name):
+            return np.array([getattr(step, name) for step in steps], KINDS.get(name, float))
+
         columns: dict[str, Any] = {name: column(name) for name in cls._fields}
         return cls(**columns)
 

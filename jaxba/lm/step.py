@@ -160,7 +160,10 @@ def take_step(
     """End of `try_step`: the state after the accept decision on a candidate, and the record.
     Arguments as there."""
     step = proposal.step
-    choose = lambda new, old: jnp.where(candidate.accepted, new, old)
+
+    def choose(new, old):
+        return jnp.where(candidate.accepted, new, old)
+
     after = jax.tree.map(choose, LMState(*candidate[:3]), state)
     tried = candidate.step_fraction * step.cameras, candidate.points - state.points
     moved, size = sum_over_devices(layout, (jnp.sum(tried[1] ** 2), jnp.sum(state.points**2)))

@@ -25,7 +25,9 @@ MAX_UNDAMPED_RATIO = 100.0
 # machine epsilons within which a damping fraction is one: for 1e30 it was just below
 FRACTION_ROUNDING = 64.0
 
-LEFT_BY_DAMPING, LEAST_LEFT, MOST_LEFT = 3000.0, 0.01, 300.0
+LEFT_BY_DAMPING = 3000.0
+LEAST_LEFT = 0.01
+MOST_LEFT = 300.0
 """What is left after a step, in units of its decrease, is at most the first number times the
 damping fraction, between the other two: so in 95 of 100 solves by the default (`python -m
 benchmarks.default_policy --within`)."""
@@ -119,7 +121,8 @@ def distance_to_end(step: StepInfo, where: Any = jnp.where) -> Any:
     of it (the fraction is zero), next steps decrease the cost by far less than this one; in a flat
     valley, where it has, by as much for many times. `where` is NumPy's for records of NumPy
     arrays."""
-    decrease, share = (step.previous_cost - step.cost) / step.cost, step.damping_fraction
+    decrease = (step.previous_cost - step.cost) / step.cost
+    share = step.damping_fraction
     # of one direction the undamped model predicts s^2 / (1 - s^2) times the decrease
     # (`converged_in_cost`)
     left = decrease * (LEFT_BY_DAMPING * share).clip(LEAST_LEFT, MOST_LEFT) / (1 - share**2)

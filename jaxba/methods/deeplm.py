@@ -59,20 +59,26 @@ def solve_normal(
     `forcing` is their forcing term. Returns the camera step (manifold coordinates), the point step,
     and the number of iterations."""
     cameras, width = system.gradient.shape
-    join = lambda c, p: jnp.concatenate([c.reshape(-1), p.reshape(-1)])
-    split = lambda x: (
-        x[: width * cameras].reshape(cameras, width),
-        x[width * cameras :].reshape(3, -1),
-    )
+
+    def join(c, p):
+        return jnp.concatenate([c.reshape(-1), p.reshape(-1)])
+
+    def split(x):
+        return (
+            x[: width * cameras].reshape(cameras, width),
+            x[width * cameras :].reshape(3, -1),
+        )
+
     point_damping = jnp.stack(points.damping)
     inverse = block_inverse(system.blocks)
 
     def apply(x: Array) -> Array:
         c, p = split(x)
         product = jacobian_product(layout, linear, c, p)
-        transposed = lambda first, second: [
-            a * product[0] + b * product[1] for a, b in zip(first, second, strict=True)
-        ]
+
+        def transposed(first, second):
+            return [a * product[0] + b * product[1] for a, b in zip(first, second, strict=True)]
+
         by_camera = tree_sum(as_rows(transposed(*linear.camera_jacobian)), layout.camera_levels)
         by_camera = by_camera + jnp.einsum("cab,cb->ca", system.own, c)
         return join(

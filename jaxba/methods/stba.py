@@ -93,7 +93,8 @@ def eliminate_replicas(
     """As `schur.eliminate_points`, for point replicas."""
     rows = jnp.stack(normal_entries(linear.point_jacobian, linear.residual))
     sums = tree_sum(rows.T, partition.levels).T
-    matrix, gradient = [sums[k] for k in range(6)], sums[6:]
+    matrix = [sums[k] for k in range(6)]
+    gradient = sums[6:]
     for entry in (0, 2, 5):
         matrix[entry] = matrix[entry] + damping_diagonal(matrix[entry], damping, options)
     diagonal = jnp.stack([matrix[entry] for entry in (0, 2, 5)])
@@ -169,5 +170,8 @@ def richardson(system: DampedSystem, step: Array, rounds: int) -> Float[Array, "
     They converge: each multiplies the error by `B^-1 E C^-1 E^T` (damped B and C), whose spectral
     radius is below one."""
     inverse = block_inverse(computed_after(step, system.cameras.blocks))
-    iteration = lambda _, x: x + inverse(system.cameras.right - apply_reduced(system, x))
+
+    def iteration(_, x):
+        return x + inverse(system.cameras.right - apply_reduced(system, x))
+
     return loops.fori_loop(0, rounds, iteration, step)

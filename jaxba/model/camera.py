@@ -100,11 +100,14 @@ def poses(
 ) -> tuple[Float[Array, "3 cameras"], Float[Array, "3 cameras"]]:
     """Angle-axis and translation of each camera, also of one in a rig: `M R_r` and `M t_r + m`
     (problem/rigs.py)."""
-    angle_axis, translation = cameras[:3], cameras[3:6]
+    angle_axis = cameras[:3]
+    translation = cameras[3:6]
     for k in unknowns.places:
-        turn, shift = cameras[k : k + 3], cameras[k + 3 : k + POSE_SIZE]
+        turn = cameras[k : k + 3]
+        shift = cameras[k + 3 : k + POSE_SIZE]
         turned = jnp.einsum("ijc,jc->ic", rotation_matrix(turn), translation, precision="highest")
-        angle_axis, translation = compose_left(turn, angle_axis), turned + shift
+        angle_axis = compose_left(turn, angle_axis)
+        translation = turned + shift
     return angle_axis, translation
 
 
@@ -130,7 +133,8 @@ def project(
     x, y, z = local = frame.model.masked(local, mask)
     # masked twice: the derivative of the quotient, too, must not see the depth of an empty slot
     inverse = jnp.where(mask, 1 / jnp.where(mask, z, jnp.ones_like(z)), jnp.zeros_like(z))
-    u, v = -x * inverse, -y * inverse
+    u = -x * inverse
+    v = -y * inverse
     radius = u * u + v * v
     pixel, distortion = frame.model.pixels(
         list(frame.lens), frame.which, local, [u, v], radius, mask
@@ -158,8 +162,11 @@ def derivatives(
         ]
     columns = range(len(by_number)) if columns is None else columns
     zero = jnp.zeros_like(projection.radius)
+
     # of a block of residuals
-    of_number = lambda k: by_number[k]() if k < len(by_number) else (zero, zero)
+    def of_number(k):
+        return by_number[k]() if k < len(by_number) else (zero, zero)
+
     numbers = list(zip(*map(of_number, columns), strict=True)) or [(), ()]
     camera = [
         [*_by_rotation(row, projection.rotated), *row, *own]
@@ -175,5 +182,6 @@ def derivatives(
 
 def _by_rotation(row: list[Array], rotated: Float[Array, "3 ..."] | list[Array]) -> list[Array]:
     """`-row [q]x` for a rotated point q."""
-    (a, b, c), (x, y, z) = row, rotated
+    (a, b, c) = row
+    (x, y, z) = rotated
     return [y * c - z * b, z * a - x * c, x * b - y * a]

@@ -103,7 +103,8 @@ def _sizes(
         unknowns: those of the problem.
         start: parameters of cameras, and points.
         extent: size of the scene, scene units."""
-    cameras, points = np.zeros_like(start[0]), np.zeros_like(start[1])
+    cameras = np.zeros_like(start[0])
+    points = np.zeros_like(start[1])
     lens = slice(POSE_SIZE, POSE_SIZE + unknowns.lens_size)
     if name == POINT:
         points[:] = extent

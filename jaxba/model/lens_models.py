@@ -86,7 +86,8 @@ class BalLens:
     def derivatives(self, lens: list[Array], which: Which, projection: Projection) -> Rows:
         """Of the pixel by the point in the camera's frame, and by the numbers of the lens."""
         u, v = projection.direction
-        radius, distortion = projection.radius, projection.distortion
+        radius = projection.radius
+        distortion = projection.distortion
         focal, k1, k2 = lens
         slope = 2 * (k1 + 2 * k2 * radius)
         scale = -focal * projection.inverse_depth
@@ -148,17 +149,19 @@ class ModelledLens:
         """The points of the plane z = -1 that are seen at the pixels, by Newton's method from the
         optical axis."""
         depth = -jnp.ones_like(lens[0])
-        pixel_at = lambda x, y: self.pixel(which, lens, x, y, depth)
-        x, y = jnp.zeros_like(lens[0]), jnp.zeros_like(lens[0])
+
+        def pixel_at(x, y):
+            return self.pixel(which, lens, x, y, depth)
+
+        x = jnp.zeros_like(lens[0])
+        y = jnp.zeros_like(lens[0])
         for _ in range(iterations):
             found, by_x = jax.jvp(lambda x, y=y: pixel_at(x, y), (x,), (jnp.ones_like(x),))
             _, by_y = jax.jvp(lambda y, x=x: pixel_at(x, y), (y,), (jnp.ones_like(y),))
             u, v = (value - pixel for value, pixel in zip(found, pixels, strict=True))
             inverse = 1 / (by_x[0] * by_y[1] - by_x[1] * by_y[0])
-            x, y = (
-                x - inverse * (by_y[1] * u - by_y[0] * v),
-                y - inverse * (by_x[0] * v - by_x[1] * u),
-            )
+            x = x - inverse * (by_y[1] * u - by_y[0] * v)
+            y = y - inverse * (by_x[0] * v - by_x[1] * u)
         return [x, y]
 
     def derivatives(self, lens: list[Array], which: Which, projection: Projection) -> Rows:
@@ -172,7 +175,9 @@ class ModelledLens:
             return first, second
 
         def by_place(k: int) -> Pair:
-            place = lambda at: [at if n == k else row for n, row in enumerate(local)]
+            def place(at):
+                return [at if n == k else row for n, row in enumerate(local)]
+
             return rate(lambda at: self.pixel(which, lens, *place(at)), local[k])
 
         def by_lens(k: int) -> Pair:

@@ -76,7 +76,10 @@ def observation_costs(
     loss: Loss,
 ) -> Float[Array, " slots"]:
     """`slot_costs` at the given parameters; zero in empty slots."""
-    terms = lambda views: [slot_costs(loss, view_residuals(views, views.projected()))]
+
+    def terms(views):
+        return [slot_costs(loss, view_residuals(views, views.projected()))]
+
     return add_costs(
         layout, cameras, points, view_terms(layout, slot_frames(layout, cameras), points, terms)[0]
     )
@@ -160,9 +163,11 @@ def linearize(
         rows = [
             row.at[found.at].add(one, mode="drop") for row, one in zip(rows, added, strict=True)
         ]
-    residual, rows = rows[:2], rows[2:]
+    residual = rows[:2]
+    rows = rows[2:]
     width = (len(rows) - 6) // 2
-    by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
+    by_camera = [rows[:width], rows[width : 2 * width]]
+    by_point = [rows[-6:-3], rows[-3:]]
     return Linearization(residual, by_camera, by_point, Reference(costs, inverse_depth))
 
 
@@ -184,7 +189,8 @@ def only_free(
     its step, is then zero, too. `layout` knows what is constant; with `fixed` intrinsics all of
     these are. `alone`: whether cameras are optimised one by one, so that what they share must be
     constant."""
-    unknowns, zero = layout.unknowns, jnp.zeros_like(linear.residual[0])
+    unknowns = layout.unknowns
+    zero = jnp.zeros_like(linear.residual[0])
     constant = unknowns.constant(intrinsics, alone=alone)
     free = unknowns.free.at_columns(layout.slot_camera)
     moves = unknowns.free_points.at_columns(layout.slot_point)

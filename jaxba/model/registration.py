@@ -206,7 +206,8 @@ def _check_lengths(
     """Raises a ValueError for an array of another length that counts, whole, for each row, where
     rows have fewer numbers than `size` with one of its entries: it was meant to have an entry for
     each row."""
-    names, data = kind.rows.residual.data, kind.rows.data
+    names = kind.rows.residual.data
+    data = kind.rows.data
     for name in kind.rows.whole:
         k = names.index(name)
         rows = replace(kind.rows, data=(*data[:k], data[k][:, 0], *data[k + 1 :]))

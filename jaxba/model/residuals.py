@@ -94,10 +94,8 @@ def _points_of(layout: Layout, rows: ResidualSlots) -> Int[Array, "ends rows"]:
 def points_alone(layout: Layout) -> Mask:
     """Which points may move while all others stay: those that are free, and in no row with another
     point."""
-    free, pairs = (
-        layout.unknowns.free_points,
-        [_points_of(layout, x) for x in layout.residuals if len(x.points) > 1],
-    )
+    free = layout.unknowns.free_points
+    pairs = [_points_of(layout, x) for x in layout.residuals if len(x.points) > 1]
     if not pairs:
         return free
     alone = (
@@ -113,7 +111,8 @@ def linearized(
     points: Float[Array, "3 _"],
 ) -> Linear:
     """Residuals and Jacobians of rows, at their slots."""
-    found, (pairs, several, _) = differentiated(rows, unknowns, cameras, points), rows.slots.shape
+    found = differentiated(rows, unknowns, cameras, points)
+    (pairs, several, _) = rows.slots.shape
     zero = jnp.zeros_like(found.costs)
     # of a row of two cameras or points each has half of the residual
     split = ROOT if several > 1 else 1.0
@@ -129,14 +128,21 @@ def linearized(
         return tuple(vectors)
 
     # of the variables that split it
-    sign = lambda here, end: jnp.full_like(zero, (1 - 2 * end) * here)
+    def sign(here, end):
+        return jnp.full_like(zero, (1 - 2 * end) * here)
+
     residual = at_slots(lambda number, end: found.residual[number] / several)
-    by_camera = lambda w: lambda number, end: found.by_camera[number, end, w]
-    by_point = lambda i: lambda number, end: found.by_point[number, end, i]
-    if len(rows.points) > 1:
-        by_camera = lambda w: lambda number, end: sign(number == w, end)
-    if len(rows.cameras) > 1:
-        by_point = lambda i: lambda number, end: sign(number % 2 == i, end)
+
+    def by_camera(w):
+        if len(rows.points) > 1:
+            return lambda number, end: sign(number == w, end)
+        return lambda number, end: found.by_camera[number, end, w]
+
+    def by_point(i):
+        if len(rows.cameras) > 1:
+            return lambda number, end: sign(number % 2 == i, end)
+        return lambda number, end: found.by_point[number, end, i]
+
     columns = (
         [at_slots(by_camera(w)) for w in range(unknowns.width)],
         [at_slots(by_point(i)) for i in range(3)],

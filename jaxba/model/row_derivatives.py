@@ -64,7 +64,8 @@ def differentiated(
     points: Float[Array, "3 _"],
 ) -> Differentiated:
     """Residuals, Jacobians and costs of all rows."""
-    given, size = _gathered(rows, unknowns, cameras, points), rows.rows.size
+    given = _gathered(rows, unknowns, cameras, points)
+    size = rows.rows.size
     try:
         found = compute_in_one_loop(functools.partial(_on_vectors, rows, unknowns), *given)
     except NotImplementedError:
@@ -82,7 +83,8 @@ def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[
     too large."""
     over_rows = given[3].ndim - 2
     numbers = [numbers_of(x, x.ndim - over_rows) for x in given]
-    function, parameters = Traced(functools.partial(_value, rows, unknowns), *numbers), numbers[:4]
+    function = Traced(functools.partial(_value, rows, unknowns), *numbers)
+    parameters = numbers[:4]
     if function.size * rows.rows.size > LARGEST:
         raise NotImplementedError("too large")
     ends = np.cumsum([x.size for x in parameters])[:-1]
@@ -91,7 +93,8 @@ def _on_vectors(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[
         parts = zip(np.split(filled(flat), ends), parameters, strict=True)
         return function(*(part.reshape(x.shape) for part, x in parts), *numbers[4:])[k]
 
-    residual, derivatives = [], []
+    residual = []
+    derivatives = []
     for k in range(rows.rows.size):
         one, pull = jax.vjp(
             functools.partial(number, k), *(x for part in parameters for x in part.flat)
@@ -116,7 +119,9 @@ def _mapped(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Arra
     """The same of any function."""
 
     def backward(*given: Array) -> tuple[Array, tuple[Array, ...]]:
-        at = lambda *parameters: _value(rows, unknowns, *parameters, *given[4:])
+        def at(*parameters):
+            return _value(rows, unknowns, *parameters, *given[4:])
+
         residual, pull = jax.vjp(at, *given[:4])
         return residual, jax.vmap(pull)(jnp.eye(len(residual), dtype=residual.dtype))
 
@@ -130,7 +135,10 @@ def _mapped(rows: ResidualSlots, unknowns: Unknowns, *given: Array) -> list[Arra
     # a loop of unknown length, or a rule for forward mode alone
     except (ValueError, TypeError, NotImplementedError):
         residual, by_parts = each(forward)(*given)
-    numbers = lambda arrays: [numbers_of(x, x.ndim - 1) for x in arrays]
+
+    def numbers(arrays):
+        return [numbers_of(x, x.ndim - 1) for x in arrays]
+
     return _weighted(rows.rows, unknowns, numbers(given), *numbers((residual, *by_parts)))
 
 
@@ -149,13 +157,16 @@ def _weighted(
     # R <- R + [w]x R changes the residual by w . sum of R_j x dr/dR_j over columns j
     turn = _cross(given[0], turn, -2).sum(axis=-1)
     if unknowns.in_rigs:  # R = M R_f and t = M t_f + m, with steps of frames and of M and m
-        place, ends = given[4], unknowns.lens_size + np.array([0, EXTRINSICS_SIZE])
-        matrix, (lens, _, own) = place[:, :9].reshape(-1, 3, 3), np.split(own, ends, axis=2)
+        place = given[4]
+        ends = unknowns.lens_size + np.array([0, EXTRINSICS_SIZE])
+        matrix = place[:, :9].reshape(-1, 3, 3)
+        (lens, _, own) = np.split(own, ends, axis=2)
         own = np.concatenate([lens, turn + _cross(place[:, 9:], shift, -1), shift, own], axis=2)
         turn, shift = ((matrix * x[..., None]).sum(axis=2) for x in (turn, shift))
     columns = [*range(POSE_SIZE), *(POSE_SIZE + column for column in unknowns.columns)]
     by_camera = np.concatenate([turn, shift, own], axis=2)[:, :, columns]
-    every, squared = [*residual, *by_camera.flat, *by_point.flat], (residual * residual).sum()
+    every = [*residual, *by_camera.flat, *by_point.flat]
+    squared = (residual * residual).sum()
     if rows.loss.trivial:
         return [*every, 0.5 * squared]
     cost, slope = rows.loss(squared)
@@ -175,20 +186,20 @@ def _gathered(
     """What a row needs of the problem, along the last axis: rotations, translations and numbers of
     its cameras, its points; in a rig M and M t_f; camera models, and the data."""
     frames = camera.frames(jnp.asarray(cameras), unknowns)
-    rotation, translation, places = (
-        jnp.asarray(frames.rotation),
-        jnp.asarray(frames.translation),
-        [],
-    )
+    rotation = jnp.asarray(frames.rotation)
+    translation = jnp.asarray(frames.translation)
+    places = []
     for place in frames.places:
         matrix = jnp.asarray(place)[:9].reshape(3, 3, -1)
         shifted = jnp.einsum("ijc,jc->ic", matrix, translation, precision="highest")
         rotation = jnp.einsum("ijc,jkc->ikc", matrix, rotation, precision="highest")
-        translation, places = shifted + jnp.asarray(place)[9:], [matrix.reshape(9, -1), shifted]
+        translation = shifted + jnp.asarray(place)[9:]
+        places = [matrix.reshape(9, -1), shifted]
     table = fusion_barrier(
         jnp.concatenate([rotation.reshape(9, -1), translation, *places, cameras[POSE_SIZE:]])
     )
-    index, end = [jnp.asarray(one) for one in rows.cameras], 12 + 12 * len(frames.places)
+    index = [jnp.asarray(one) for one in rows.cameras]
+    end = 12 + 12 * len(frames.places)
     table = jnp.stack(
         [jnp.stack(compute_unfused(take_each, table, one, index=one)) for one in index]
     )

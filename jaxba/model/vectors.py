@@ -87,11 +87,14 @@ class Traced:
 
 def _size(closed: Any) -> int:
     """Number of operations on vectors."""
-    own = lambda x: (
-        _size(x.params["jaxpr"])
-        if x.primitive.name in CALLS
-        else math.prod(x.outvars[0].aval.shape)
-    )
+
+    def own(x):
+        return (
+            _size(x.params["jaxpr"])
+            if x.primitive.name in CALLS
+            else math.prod(x.outvars[0].aval.shape)
+        )
+
     return sum(own(x) for x in closed.jaxpr.eqns if x.primitive.name not in MOVES)
 
 
@@ -99,7 +102,10 @@ def _evaluated(closed: Any, operands: Any) -> list[Numbers]:
     jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.constvars, map(_constant, closed.consts), strict=True))
     known |= zip(jaxpr.invars, operands, strict=True)
-    read = lambda x: _constant(x.val) if hasattr(x, "val") else known[x]  # a literal or a variable
+
+    def read(x):
+        return _constant(x.val) if hasattr(x, "val") else known[x]  # a literal or a variable
+
     for equation in jaxpr.eqns:
         given = [read(x) for x in equation.invars]
         known |= zip(equation.outvars, _applied(equation, given), strict=True)
@@ -121,12 +127,13 @@ def filled(values: Sequence[Any], shape: tuple[int, ...] = (-1,)) -> Numbers:
 
 def _applied(equation: Any, given: list[Numbers]) -> list[Numbers]:
     """The results of a primitive."""
-    name, parameters, shape = (
-        equation.primitive.name,
-        equation.params,
-        equation.outvars[0].aval.shape,
-    )
-    total = lambda rows: filled([sum(row[1:], start=row[0]) for row in rows], shape)
+    name = equation.primitive.name
+    parameters = equation.params
+    shape = equation.outvars[0].aval.shape
+
+    def total(rows):
+        return filled([sum(row[1:], start=row[0]) for row in rows], shape)
+
     if name in CALLS:
         return _evaluated(parameters["jaxpr"], given)
     if name in MOVES:

@@ -55,10 +55,12 @@ SINGULAR = 1e-9  # smallest eigenvalue of normal equations with a unit diagonal 
 BETTER = 0.99  # share of the cost at a smaller turn that a larger one must have to be taken
 
 # most steps, and the relative decrease of the cost after which there are no more
-ITERATIONS, ENOUGH = 30, 1e-9
+ITERATIONS = 30
+ENOUGH = 1e-9
 
 # the first damping, as a share of the diagonal, and by what it changes
-DAMPING, FACTOR = 1e-9, 10.0
+DAMPING = 1e-9
+FACTOR = 10.0
 
 MOST_SHRUNK = -0.9  # change of the scale in a step, as a share: it stays positive
 
@@ -316,7 +318,8 @@ def _some(kind: ResidualSlots) -> ResidualSlots:
 
 def _about_similarity(normal: Float[np.ndarray, "numbers numbers"]) -> Float[np.ndarray, "7 7"]:
     """The information on a similarity alone, with the numbers of blocks eliminated."""
-    first, last = slice(SIMILARITY), slice(SIMILARITY, None)
+    first = slice(SIMILARITY)
+    last = slice(SIMILARITY, None)
     roots = np.sqrt(np.diagonal(normal)[last])
     inverse = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0)
     scaled = inverse[:, None] * normal[last, last] * inverse
@@ -370,7 +373,9 @@ def _expansions(
                 of_kinds.append(values(replace(kind, rows=frame), unknowns, state, points))
             return of_kinds
 
-        costs, gradients, normals = [], [], []
+        costs = []
+        gradients = []
+        normals = []
         for kind, at, by in zip(kinds, residuals(zero), jax.jacfwd(residuals)(zero), strict=True):
             squared = jnp.sum(at * at, axis=0)
             cost, slope = (

@@ -130,7 +130,10 @@ def train(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str
     begun = (own / driver.CONFIG).is_file()
     settings = driver.prepare_folder(own, train_config(config, agent), resume=begun)
     work, played = game_of(config, agent, folder, report)
-    note = lambda rows: report(f"{agent.name}: {rows[0]['chunk']} of {settings.chunks} parts")
+
+    def note(rows):
+        return report(f"{agent.name}: {rows[0]['chunk']} of {settings.chunks} parts")
+
     outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
     # every run's own, so that no choice is made among them
     for file, best in zip(files, outcome.best, strict=True):
@@ -159,7 +162,8 @@ def best_constant(
 def collapsed(config: PaperConfig, agent: Agent, folder: Path) -> list[bool]:
     """Of every training run, whether its policy did the same in every state in the end; none before
     it is trained."""
-    rows, wired = log.read(own_folder(agent, folder)), train_config(config, agent).game.agent
+    rows = log.read(own_folder(agent, folder))
+    wired = train_config(config, agent).game.agent
     decades = (wired.high - wired.low) / 2
     return [
         decades * row["action_spread"] < view.SAME

@@ -86,7 +86,8 @@ def ratio_claim(
     seconds."""
     if ours is None or base is None or not _comparable(of, ours, base):
         return Claim(text, f"{paper:.2f}", "-", "not run")
-    one, other = getattr(ours, of), getattr(base, of)
+    one = getattr(ours, of)
+    other = getattr(base, of)
     found = one / other
     near_enough = paper / RATIO_TOLERANCE <= found <= RATIO_TOLERANCE * paper
     status: Status = "reproduced" if near_enough else "partly" if found <= PARTLY_RATIO else "not"
@@ -95,10 +96,8 @@ def ratio_claim(
     )
     detail = f"{found:.2f} ({parts})"
     if is_less_successful(ours, base):
-        status, detail = (
-            "not",
-            f"{detail}, success {100 * ours.success:.0f} % against {100 * base.success:.0f} %",
-        )
+        status = "not"
+        detail = f"{detail}, success {100 * ours.success:.0f} % against {100 * base.success:.0f} %"
     near = (
         f"{ours.near / base.near:.2f} ({ours.near:.1f} / {base.near:.1f})"
         if of == "iterations"

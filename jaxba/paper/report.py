@@ -53,7 +53,8 @@ def write(runner: Runner, path: Path, command: str) -> list[Path]:
 
 def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
     """What the report begins with: how it was made, and the table of claims."""
-    properties, agents = machine(), runner.config.agents
+    properties = machine()
+    agents = runner.config.agents
     lengths = ", ".join(str(updates(runner.config, one)) for one in (PRINTED, OURS, BEST))
     tally = {
         status: sum(c.status == status for c in claims)

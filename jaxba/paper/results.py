@@ -25,7 +25,8 @@ from jaxba.solver.record import Record
 
 T = TypeVar("T")
 
-SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
+SOLVES = "solves.jsonl"
+PLAYS = "plays.jsonl"
 
 # relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost
 NEAR = 1e-3
@@ -86,7 +87,10 @@ class Store:
 
     def solves_of(self, problems: Sequence[str], solvers: Sequence[str]) -> list[Record]:
         """The solves of the given problems by the given solvers, in the order of these lists."""
-        rank = lambda r: (problems.index(r.problem), solvers.index(r.solver), r.repeat)
+
+        def rank(r):
+            return (problems.index(r.problem), solvers.index(r.solver), r.repeat)
+
         return sorted(
             (r for r in self.solves if r.problem in problems and r.solver in solvers), key=rank
         )
@@ -177,7 +181,8 @@ def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Out
 def _outcome(
     iterations: int, converged: bool, near: float, end: float, seconds: float = math.nan
 ) -> Outcome:
-    limit, good = float(ITERATION_LIMIT), converged and iterations <= ITERATION_LIMIT
+    limit = float(ITERATION_LIMIT)
+    good = converged and iterations <= ITERATION_LIMIT
     return Outcome(
         float(iterations) if good else limit, good, min(max(near, 1.0), limit), end, seconds
     )

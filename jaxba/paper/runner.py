@@ -37,7 +37,8 @@ from jaxba.typing import InputError
 LIMIT = profile.ITERATION_LIMIT
 
 # agents trained on other real problems, and untrained twins
-ELSEWHERE, CONSTANT = "-elsewhere", "-constant"
+ELSEWHERE = "-elsewhere"
+CONSTANT = "-constant"
 TEST = "test"  # name of the scenes of the tables in records
 SMALL = "small"  # family of the small random scenes
 
@@ -93,7 +94,9 @@ class Runner:
     ) -> None:
         """Reads the results that the folder, which must exist, has. `report` is called with a line
         of text when something starts. Raises ProblemError: a file of results is damaged."""
-        self.config, self.folder, self.report = config, folder, report
+        self.config = config
+        self.folder = folder
+        self.report = report
         self.store = Store(folder)
         self.done = 0  # solves, plays and trainings of this process
         self._read: tuple[Source, BundleProblem] | None = None
@@ -116,7 +119,10 @@ class Runner:
 
     def elsewhere(self, kind: Agent, method: str = "lm", *, twin: bool = False) -> Method:
         """The same with agents trained on windows of other real problems."""
-        find = lambda source: source and agents.trained_elsewhere(self.config, source, kind, method)
+
+        def find(source):
+            return source and agents.trained_elsewhere(self.config, source, kind, method)
+
         name = f"{kind.name}{ELSEWHERE}"
         return self._method(name if method == "lm" else f"{method}+{name}", find, method, twin=twin)
 
@@ -130,7 +136,8 @@ class Runner:
         twin: bool,
     ) -> Method:
         def build(seed: int, source: Source | None) -> Built | None:
-            agent, where = find(source), (self.folder, self.report)
+            agent = find(source)
+            where = (self.folder, self.report)
             if agent is None:
                 return None
             if twin:
@@ -159,7 +166,8 @@ class Runner:
 
     def _zero_net(self, seed: int, _: Any) -> Built:
         settings = agents.train_config(self.config, agents.OURS)
-        agent, path = settings.game.agent, self.folder / "agents" / f"zero-net-{seed}.npz"
+        agent = settings.game.agent
+        path = self.folder / "agents" / f"zero-net-{seed}.npz"
         if path.is_file():
             net = zero_net.restore(path, self.config.zero_net, agent)
         else:

@@ -33,7 +33,8 @@ def sub_problem(
             raise ProblemError(
                 f"there is no {name} {numbers[0] if numbers[0] < 0 else numbers[-1]} among {count}"
             )
-    camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    camera_index = np.asarray(problem.camera_index)
+    point_index = np.asarray(problem.point_index)
     keep = np.isin(camera_index, kept) & np.isin(point_index, allowed)
     pairs = np.unique(np.stack([point_index[keep], camera_index[keep]]), axis=1)
     # of distinct cameras: one may observe a point twice
@@ -58,7 +59,8 @@ def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, 
     )
     seen.data[:] = 1  # a camera may observe a point twice
     chosen = [int(np.argmax(seen.getnnz(axis=1)))]
-    shared, covered = np.zeros(problem.num_cameras, int), np.zeros(problem.num_points, bool)
+    shared = np.zeros(problem.num_cameras, int)
+    covered = np.zeros(problem.num_points, bool)
     free = np.ones(problem.num_cameras, bool)
     while len(chosen) < count:
         free[chosen[-1]] = False

@@ -40,7 +40,8 @@ from jaxba.typing import register_pytree
 # of log10(cost) by the action, for each scene; that of a step of non-finite cost is its negative
 MAX_SLOPE = 1.0
 
-_DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
+_DAMPING = StepFeatures._fields.index("damping")
+_PRESENT = StepFeatures._fields.index("present")
 
 
 @register_pytree
@@ -128,7 +129,10 @@ def _train(
         def loss(layers: tuple[Layer, ...]) -> tuple[Array, tuple[Episode, StepInfo, Array]]:
             policy = ZeroNet(layers, net.config)
             actions = jax.vmap(lambda episode: policy.act(episode.memory))(episodes)
-            step_one = lambda episode, action: slope_of_next_cost(game, episode, action)
+
+            def step_one(episode, action):
+                return slope_of_next_cost(game, episode, action)
+
             change, slope, after, step = step_groups(step_one, episodes, lax.stop_gradient(actions))
             known = jnp.isfinite(change) & jnp.isfinite(slope)
             slope = jnp.clip(jnp.where(known, slope, -MAX_SLOPE), -MAX_SLOPE, MAX_SLOPE).astype(
@@ -143,7 +147,10 @@ def _train(
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, Tolerances().ftol)
         done = converged | (after.memory.iteration >= config.max_iterations)
         new = jax.vmap(another)(jnp.stack(keys))
-        pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        def pick(new, old):
+            return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
         episodes = jax.tree.map(pick, new, after)
         layers = optax.apply_updates(layers, change)
         return (layers, optimiser, episodes, key), counted

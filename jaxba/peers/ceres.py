@@ -190,7 +190,8 @@ class _RecordingCallback(pyceres.IterationCallback):
 
     def __init__(self, run: Run, mode: str) -> None:
         super().__init__()
-        self.run, self.mode = run, mode
+        self.run = run
+        self.mode = mode
         self.reset()
 
     def reset(self) -> None:
@@ -201,7 +202,8 @@ class _RecordingCallback(pyceres.IterationCallback):
         self.cost: Any = np.nan
 
     def __call__(self, summary: Any) -> Any:
-        kind, stop = pyceres.CallbackReturnType, False
+        kind = pyceres.CallbackReturnType
+        stop = False
         if self.last is None:
             self.cost = summary.cost
         else:
@@ -251,7 +253,8 @@ def solve_by_ceres(
     options.function_tolerance, options.parameter_tolerance = tolerances.ftol, tolerances.xtol
     options.gradient_tolerance = tolerances.gtol
     options.update_state_every_iteration = True
-    recorder, summary = _RecordingCallback(run, mode), pyceres.SolverSummary()
+    recorder = _RecordingCallback(run, mode)
+    summary = pyceres.SolverSummary()
     options.callbacks = [recorder]
     run.start()
     while True:

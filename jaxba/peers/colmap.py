@@ -94,7 +94,8 @@ class TwoSidedReprojection(pyceres.CostFunction):
         """`f (1 + k1 r + k2 r^2) p + c - z` with `p = P.xy / P.z` and `r = |p|^2`, and the
         requested Jacobians."""
         point, pose, (f, cx, cy, k1, k2) = parameters
-        v, w = pose[:3], pose[3]
+        v = pose[:3]
+        w = pose[3]
         turned = np.cross(v, point)
         local = point + 2 * (w * turned + np.cross(v, turned)) + pose[4:]
         with np.errstate(all="ignore"):
@@ -161,7 +162,8 @@ class ColmapProblem:
             self.ceres.set_manifold(self._lenses[camera], self._manifolds[1])
 
     def _add_observation(self, observation: int, cost: Any) -> None:
-        camera, point = self.start.camera_index[observation], self.start.point_index[observation]
+        camera = self.start.camera_index[observation]
+        point = self.start.point_index[observation]
         self._costs[observation] = cost(self.pixels[observation])
         blocks = [self._points[point], self._poses[camera], self._lenses[camera]]
         self._residuals[observation] = self.ceres.add_residual_block(
@@ -190,7 +192,8 @@ class ColmapProblem:
     def bundle(self) -> BundleProblem:
         """The problem at the current parameters. Cameras without observations are unchanged."""
         cameras: Any = np.array(self.start.cameras, np.float64)
-        poses, lenses = self.poses[self.observing], self.lenses[self.observing]
+        poses = self.poses[self.observing]
+        lenses = self.lenses[self.observing]
         cameras[self.observing] = np.hstack(
             [bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]]
         )

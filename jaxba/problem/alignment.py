@@ -14,7 +14,10 @@ from jaxba.problem.labels import part_name
 from jaxba.problem.misfit import BENDS, MISFIT, extent_of, off_by, wrong_places, wrong_text
 from jaxba.problem.similarity import Similarity, along_line, transformed, umeyama
 
-STARTS, ROUNDS, KEPT, COMPARED = 20, 10, 0.5, 2 / 3
+STARTS = 20
+ROUNDS = 10
+KEPT = 0.5
+COMPARED = 2 / 3
 """Starts of a robust alignment, the rounds of each, the share of the images that these keep, and
 that by which ends are compared: it stands a third of the positions wrong, of which all starts have
 one in 1 of 300."""
@@ -28,15 +31,20 @@ MOST = 0.75  # share of the images that must fit: it is noted if fewer do
 
 DOUBTFUL = 2.0  # distance, over that of noise, from which other axes or units are tried
 
-BETTER, EXPLAINED, LEAST_IMAGES = 0.3, 0.1, 5
+BETTER = 0.3
+EXPLAINED = 0.1
+LEAST_IMAGES = 5
 """Other axes or units are taken for the true ones if they leave this share of the misfit, and no
 more than this share of the extent, with so many images: of four, half fit too well by chance, so
 that all must fit."""
 
-MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
+MEDIAN = 1.538
+UPPER_QUARTER = 2.027
+NEARLY_ALL = 3.37
 """Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
 
-LARGEST_AREA, EARTH = 1.0, 6.371e6
+LARGEST_AREA = 1.0
+EARTH = 6.371e6
 """Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent.
 Radius, metres."""
 
@@ -174,7 +182,9 @@ def _robust_fit(
 ) -> tuple[Similarity, int]:
     """The similarity that fits most images, and in how many directions, at most two, positions and
     centres spread."""
-    rng, best, least = np.random.default_rng(0), None, np.inf
+    rng = np.random.default_rng(0)
+    best = None
+    least = np.inf
     count = len(centers)
     for start in range(STARTS):
         kept = np.arange(count) if start == 0 else rng.choice(count, min(3, count), replace=False)
@@ -185,7 +195,8 @@ def _robust_fit(
         nearest = float(np.sort(distance)[: int(np.ceil(COMPARED * count))].sum())
         # of more than half: that may lie on a line, and others not
         if best is None or nearest < least:
-            best, least = distance, nearest
+            best = distance
+            least = nearest
     assert best is not None
     # in standard deviations: the scene has its own
     error = max(1.0, float(np.median(best)) / MEDIAN)

@@ -153,7 +153,8 @@ class BundleProblem(ArrayRecord):
             cameras = _floats("cameras", cameras, POSE_SIZE + lens_size(lenses))
             alone = points is None and observations is None
             if alone:
-                points, observations = np.zeros((0, POINT_SIZE)), np.zeros((0, 2))
+                points = np.zeros((0, POINT_SIZE))
+                observations = np.zeros((0, 2))
                 lenses = lenses or Lenses(
                     np.arange(len(cameras)), np.zeros((len(cameras), LENS_SIZE), bool)
                 )

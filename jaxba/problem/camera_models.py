@@ -95,7 +95,8 @@ def _bal(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
     """BAL's camera: pixels have y upwards. Source: Agarwal et al. 2010, "Bundle Adjustment in the
     Large"."""
     f, k1, k2 = lens
-    u, v = x / z, y / z
+    u = x / z
+    v = y / z
     r2 = u * u + v * v
     scale = f * (1 + r2 * (k1 + r2 * k2))
     return scale * u, -scale * v
@@ -165,7 +166,8 @@ def _rad_tan_thin_prism(u: Any, v: Any, *numbers: Any) -> Pixel:
     """Source: Project Aria, "Fisheye62" with thin prism terms."""
     *k, p0, p1, s0, s1, s2, s3 = numbers
     factor, _ = _radial(u, v, k)
-    u, v = factor * u, factor * v
+    u = factor * u
+    v = factor * v
     r2 = u * u + v * v
     du, dv = _tangential(u, v, r2, p1, p0)
     return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
@@ -175,8 +177,10 @@ def _field_of_view(u: Any, v: Any, omega: Any) -> Pixel:
     """`atan(2 r tan(omega / 2)) / (r omega)`. Source: Devernay and Faugeras 2001, "Straight lines
     have to be straight"; the two series are COLMAP's."""
     xp = u.__array_namespace__()
-    r2, omega2 = u * u + v * v, omega * omega
-    flat, near = omega2 < FOV_SMALL, r2 < FOV_SMALL
+    r2 = u * u + v * v
+    omega2 = omega * omega
+    flat = omega2 < FOV_SMALL
+    near = r2 < FOV_SMALL
     safe = xp.where(flat, xp.ones_like(omega), omega)
     tangent = xp.tan(safe / 2)
     r = xp.sqrt(xp.where(near, xp.ones_like(r2), r2))
@@ -227,7 +231,8 @@ def _distorted(
     return lens[0] * u + cx, lens[focals - 1] * v + cy
 
 
-_ONE, _TWO = "f cx cy", "fx fy cx cy"
+_ONE = "f cx cy"
+_TWO = "fx fy cx cy"
 
 BAL = register_camera_model("BAL", "f k1 k2", _bal)
 """The model of BAL, with analytic derivatives in a solve where all lenses are of it."""

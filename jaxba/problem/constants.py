@@ -36,10 +36,8 @@ class Constants(ArrayRecord):
 def checked_constants(constants: Constants, cameras: int, points: int) -> Constants | None:
     """Checks constants and returns them as NumPy arrays; None if nothing is constant. Raises
     ValueError: shapes or types differ, or part of a rotation is constant; one line."""
-    poses, fixed = (
-        plain_array("constant poses", constants.poses),
-        plain_array("constant points", constants.points),
-    )
+    poses = plain_array("constant poses", constants.poses)
+    fixed = plain_array("constant points", constants.points)
     for name, array, shape in (
         ("poses", poses, (cameras, POSE_SIZE)),
         ("points", fixed, (points,)),

@@ -14,7 +14,8 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.similarity import upright
 
-POINTS, RADIUS = 20_000, 2.5
+POINTS = 20_000
+RADIUS = 2.5
 """Most points of a picture, and half of its side, where four fifths of the scene lie within 1."""
 
 
@@ -51,7 +52,8 @@ def card_of(problem: BundleProblem) -> str:
 def from_above(problem: BundleProblem) -> Picture:
     """Cameras, with their directions, and points, from above."""
     picture = Picture(figsize=(4, 4), layout="constrained")
-    axes, similarity = picture.subplots(), upright(problem)
+    axes = picture.subplots()
+    similarity = upright(problem)
     points = similarity.points(np.asarray(problem.points)[:: 1 + problem.num_points // POINTS])
     poses = similarity.poses(geometry.camera_poses(problem.cameras))
     axes.plot(points[:, 0], points[:, 1], ",", color="0.5", zorder=0)

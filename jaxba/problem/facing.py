@@ -56,9 +56,11 @@ def set_aside(problem: BundleProblem) -> Int[np.ndarray, " away"]:
 def aside_text(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> str:
     """How many views of which images are left out since they lie behind, one line."""
     views = int(np.isin(problem.camera_index, away).sum())
-    whose, stay = f"{len(away)} images that face", "their poses stay as they are"
+    whose = f"{len(away)} images that face"
+    stay = "their poses stay as they are"
     if len(away) == 1:
-        whose, stay = "an image that faces", "its pose stays as it is"
+        whose = "an image that faces"
+        stay = "its pose stays as it is"
     if problem.rigs is not None:
         stay = "only a rig moves them" if len(away) > 1 else "only its rig moves it"
     names = part_names(problem.labels, "image", away, NAMED)

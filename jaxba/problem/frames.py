@@ -23,13 +23,15 @@ def in_frames(problem: BundleProblem) -> BundleProblem:
     rigs = problem.rigs
     if rigs is None:
         return problem
-    frame, cameras = np.asarray(rigs.frame), np.asarray(problem.cameras)
+    frame = np.asarray(rigs.frame)
+    cameras = np.asarray(problem.cameras)
     seen = np.flatnonzero(observed(problem)[0])
     if len(np.unique(frame[seen])) == len(seen):
         held = problem.constants  # also by cameras of a frame that nothing sees
         held = held and replace(held, poses=~free_poses(problem)[:, :POSE_SIZE])
         return problem.replace(rigs=None, constants=held)
-    rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
+    rotation = np.asarray(rigs.rotation)
+    translation = np.asarray(rigs.translation)
     of_frame, at = frame_poses(rotation, translation, cameras)
     poses = np.hstack([angle_axis(of_frame), at])
     poses = poses[first_of_group(frame, seen)]  # bit for bit the same in a frame
@@ -42,7 +44,8 @@ def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
 
     Constant numbers of one camera are constant in its frame, also of one that nothing sees. The
     extrinsics of a lens are constant where the pose of some camera of it is."""
-    constants, rigs = problem.constants, problem.rigs
+    constants = problem.constants
+    rigs = problem.rigs
     shape = problem.num_cameras, POSE_SIZE
     held = np.zeros(shape, bool) if constants is None else np.asarray(constants.poses)
     if rigs is None:
@@ -59,8 +62,11 @@ def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
 def num_unknowns(problem: BundleProblem) -> int:
     """How many numbers of a problem are optimised: of poses, lenses, places in rigs, observed
     points and blocks of residuals, each once. Source: Ceres, `num_effective_parameters_reduced`."""
-    here, (cameras, points) = in_frames(problem), observed(problem)
-    free, seen, lenses = free_poses(here), np.flatnonzero(cameras), every_lens(problem)
+    here = in_frames(problem)
+    (cameras, points) = observed(problem)
+    free = free_poses(here)
+    seen = np.flatnonzero(cameras)
+    lenses = every_lens(problem)
     lens = np.asarray(lenses.index)
     frame = np.arange(len(free)) if here.rigs is None else np.asarray(here.rigs.frame)
     frames, images = (seen[np.unique(group[seen], return_index=True)[1]] for group in (frame, lens))
@@ -92,8 +98,12 @@ def out_of_frames(
     from scipy.spatial.transform import Rotation
 
     assert problem.rigs is not None
-    turns = lambda vectors: Rotation.from_rotvec(vectors).as_matrix()
-    rigs, extrinsics = problem.rigs, cameras[:, -EXTRINSICS_SIZE:]
+
+    def turns(vectors):
+        return Rotation.from_rotvec(vectors).as_matrix()
+
+    rigs = problem.rigs
+    extrinsics = cameras[:, -EXTRINSICS_SIZE:]
     free = free_poses(problem)[:, POSE_SIZE:]
     rotation = np.where(free[:, :1, None], turns(extrinsics[:, :3]), rigs.rotation)
     translation = np.where(free[:, 3:], extrinsics[:, 3:], rigs.translation)

@@ -64,12 +64,14 @@ def freedoms(
     derivatives of poses by the seven, and of extrinsics in rigs, (cameras, numbers, 7), with
     lengths in extents and zero for what is constant; which points move; the middle and the extent.
     Without `of_rows` residuals other than those of pixels fix nothing."""
-    here, constants = in_frames(problem), problem.constants
+    here = in_frames(problem)
+    constants = problem.constants
     seen, points_move = observed(problem)
     middle, extent = middle_and_extent(problem)
     extent = extent if extent > 0 else 1.0
     cameras = np.asarray(here.cameras, np.float64)
-    rotation, free = geometry.rotation_matrices(cameras[:, :3]), free_poses(here)
+    rotation = geometry.rotation_matrices(cameras[:, :3])
+    free = free_poses(here)
     steps = np.zeros((*free.shape, SIMILARITY))
     steps[:, :3, :3] = steps[:, 3:6, 3:6] = -rotation
     steps[:, 3:6, :3] = np.cross(middle, rotation) / extent
@@ -108,7 +110,8 @@ def _scale_rigs(
         np.asarray(x) for x in (here.rigs.frame, here.rigs.rotation, here.rigs.translation)
     )
     places_move = free[:, POSE_SIZE:].any(axis=1)
-    held, moving = np.flatnonzero(seen & ~places_move), np.flatnonzero(seen & places_move)
+    held = np.flatnonzero(seen & ~places_move)
+    moving = np.flatnonzero(seen & places_move)
     if len(held):
         first = np.where(np.isin(frame, frame[held]), first_of_group(frame, held), held[0])
         center = np.einsum("nji,nj->ni", turn, moved)[first]

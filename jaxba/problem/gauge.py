@@ -90,11 +90,10 @@ def _two_cameras(
     """The constants, with numbers of two cameras that fix all directions; None if there are none.
     `steps` are those of poses along the directions, radians and extents of the scene, zero for what
     is constant."""
-    here, constants = (
-        in_frames(problem),
-        constants_of(problem.constants, problem.num_cameras, problem.num_points),
-    )
-    free, turned = free_poses(here), np.zeros(problem.num_cameras, bool)
+    here = in_frames(problem)
+    constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
+    free = free_poses(here)
+    turned = np.zeros(problem.num_cameras, bool)
     # whose place in a rig is constant
     seen = np.flatnonzero(observed(problem)[0] & ~free[:, POSE_SIZE:].any(axis=1))
     # of one frame only one, and with the axes of the frame if there are such
@@ -105,7 +104,10 @@ def _two_cameras(
     if not len(seen):
         return None
     centers = camera_centers(problem.cameras)[seen]
-    away = lambda x: np.linalg.norm(centers - x, axis=1)
+
+    def away(x):
+        return np.linalg.norm(centers - x, axis=1)
+
     whole = ~free[seen, :POSE_SIZE].any(axis=1)  # a constant pose is the first, if there is one
     first = int(np.argmin(np.where(whole | ~whole.any(), away(np.median(centers, axis=0)), np.inf)))
     second = int(np.argmax(np.where(turned[seen], -1.0, away(centers[first]))))
@@ -128,10 +130,8 @@ def _three_points(problem: BundleProblem) -> Constants:
     """The constants, with points that fix all directions, three at most. Raises ProblemError: there
     are too few."""
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    tracks, points = (
-        np.bincount(problem.point_index, minlength=problem.num_points),
-        np.asarray(problem.points),
-    )
+    tracks = np.bincount(problem.point_index, minlength=problem.num_points)
+    points = np.asarray(problem.points)
     often = tracks >= max(2, int(np.median(tracks[tracks > 0])) if tracks.any() else 0)
     held = np.flatnonzero(constants.points & (tracks > 0)).tolist()
     for _ in range(3):

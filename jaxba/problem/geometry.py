@@ -139,9 +139,11 @@ def pixels(
 ) -> Float[np.ndarray, "n 2"]:
     """Pixels of points in cameras' frames, COLMAP's axes (x right, y down, z forwards), by the
     lenses' models."""
-    numbers, lenses = np.asarray(problem.cameras, dtype=np.float64)[:, 6:][camera], problem.lenses
+    numbers = np.asarray(problem.cameras, dtype=np.float64)[:, 6:][camera]
+    lenses = problem.lenses
     models = (BAL,) if lenses is None else lenses.models
-    own, result = [np.arange(len(camera))], np.empty((len(camera), 2))
+    own = [np.arange(len(camera))]
+    result = np.empty((len(camera), 2))
     if lenses is not None and lenses.model is not None:
         model_of = np.asarray(lenses.model)[np.asarray(lenses.index)[camera]]
         own = [np.flatnonzero(model_of == number) for number in range(len(models))]
@@ -193,7 +195,8 @@ def _camera_frames(problem: BundleProblem) -> Iterator[tuple[slice, np.ndarray, 
     X + t` (n, 3)."""
     cameras = np.asarray(problem.cameras, dtype=np.float64)
     points = np.asarray(problem.points, dtype=np.float64)
-    camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    camera_index = np.asarray(problem.camera_index)
+    point_index = np.asarray(problem.point_index)
     rotation = rotation_matrices(cameras[:, :3])
     for start in range(0, problem.num_observations, CHUNK):
         part = slice(start, start + CHUNK)

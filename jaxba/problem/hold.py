@@ -95,7 +95,8 @@ def _images(
     rigs = problem.rigs
     if rigs is None or rigs.free is None:
         return np.ones(problem.num_cameras, bool)
-    known, frame = ~np.asarray(rigs.free), np.asarray(rigs.frame)
+    known = ~np.asarray(rigs.free)
+    frame = np.asarray(rigs.frame)
     lost = np.flatnonzero(~np.isin(frame, frame[known]))
     if len(lost):
         name = part_name(problem.labels, "image", int(lost[0]))

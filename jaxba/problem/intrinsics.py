@@ -68,7 +68,8 @@ def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
     """Checks the lenses of cameras and returns them as int32 and bool NumPy arrays. Raises
     ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in
     their intrinsics. The message is one line."""
-    free, size = plain_array("free of lenses", lenses.free), lens_size(lenses)
+    free = plain_array("free of lenses", lenses.free)
+    size = lens_size(lenses)
     names = "f, k1 and k2" if lenses.all_bal else f"{size} numbers"
     if free.ndim != 2 or free.shape[1] != size or free.dtype != bool:
         raise ValueError(

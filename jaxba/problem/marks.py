@@ -104,9 +104,10 @@ def with_marks(
     )
     seen = [points[point[camera == image[mark == one][0]]] for one in range(count)]
     starts = np.stack([np.median(own if len(own) else points, axis=0) for own in seen])
-    joined = lambda old, new: np.concatenate([np.asarray(old), np.asarray(new)]).astype(
-        np.asarray(old).dtype
-    )
+
+    def joined(old, new):
+        return np.concatenate([np.asarray(old), np.asarray(new)]).astype(np.asarray(old).dtype)
+
     changes: dict[str, Any] = {
         "points": joined(points, starts),
         "observations": joined(problem.observations, pixels),

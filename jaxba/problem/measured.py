@@ -97,10 +97,8 @@ def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> Bundl
     or a standard deviation that is not positive; one line."""
     lenses = every_lens(problem)
     used, first = np.unique(lenses.index, return_index=True)
-    mean, weight = (
-        np.asarray(problem.cameras)[first, POSE_SIZE:],
-        np.zeros(np.asarray(lenses.free).shape),
-    )
+    mean = np.asarray(problem.cameras)[first, POSE_SIZE:]
+    weight = np.zeros(np.asarray(lenses.free).shape)
     if not isinstance(numbers, dict):
         raise ValueError(
             f"standard deviations are a dict by the names of numbers, not {shown(numbers)}"
@@ -136,7 +134,8 @@ def lens_prior(lens, *, mean, weight):
 
 def _with(problem: BundleProblem, rows: Rows) -> BundleProblem:
     """The problem with rows of a prior in place of earlier ones of the same cameras or lenses."""
-    known, kept = problem.residuals, []
+    known = problem.residuals
+    kept = []
     for one in known.rows:
         if one.residual == rows.residual:
             one = one.of(~np.isin(one.index[0], rows.index[0]))

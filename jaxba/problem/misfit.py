@@ -24,7 +24,8 @@ LEAST = 5  # places of which one can be told apart: of four, any three fit nearl
 
 NAMED = 3  # places that a note names
 
-STEEP, NEARLY_ALL_IMAGES = 0.7, 0.9
+STEEP = 0.7
+NEARLY_ALL_IMAGES = 0.9
 """Cosine of an angle from the vertical within which images say what is up, and the share of them
 that must agree."""
 

@@ -45,7 +45,8 @@ def part(
     Raises ValueError: no such image or point, or no count. Raises NothingObserved, a ProblemError:
         nothing is left."""
     check_count("min_track", min_track, 0)
-    camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    camera = np.asarray(problem.camera_index)
+    point = np.asarray(problem.point_index)
     mine = mask_of(problem, images, problem.num_cameras, "image")
     whole, dropped = (
         mask_of(problem, which, problem.num_points, "point") for which in (points, ignored)
@@ -57,7 +58,8 @@ def part(
     left = np.bincount(point[counts], minlength=problem.num_points)
     lenses = every_lens(problem)
     used = np.bincount(np.asarray(lenses.index)[mine], minlength=len(lenses.free)) > 0
-    poses, rigs = ~mine, problem.rigs
+    poses = ~mine
+    rigs = problem.rigs
     if rigs is not None:  # frames without a chosen image, by what says where they are
         poses = ~np.isin(rigs.frame, np.asarray(rigs.frame)[mine])
         poses &= True if rigs.free is None else ~np.asarray(rigs.free)
@@ -77,7 +79,8 @@ class Observed(NamedTuple):
         their lens."""
         if self.problem is of:
             return found
-        cameras, points = np.array(of.cameras, np.float64), np.array(of.points, np.float64)
+        cameras = np.array(of.cameras, np.float64)
+        points = np.array(of.points, np.float64)
         cameras[self.cameras], points[self.points] = found.cameras, found.points
         lens = np.asarray(every_lens(of).index)
         used, first = np.unique(lens[self.cameras], return_index=True)

@@ -25,7 +25,10 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.row_data import Datum
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
-POSE, LENS, POINT, PIXELS = "pose", "lens", "point", "pixels"
+POSE = "pose"
+LENS = "lens"
+POINT = "point"
+PIXELS = "pixels"
 """Names of unknowns that every problem has, and of the costs of its observations."""
 
 SECOND = "_2"  # ending of the names of a second camera's unknowns
@@ -256,7 +259,8 @@ class Residuals(ArrayRecord):
         """Those of a problem whose positions x have become `scale rotation x + translation`."""
         found = []
         for rows in self.rows:
-            own, turn = np.asarray(rows.scale / scale), np.asarray(rows.rotation) @ rotation.T
+            own = np.asarray(rows.scale / scale)
+            turn = np.asarray(rows.rotation) @ rotation.T
             back = rows.translation - own * turn @ translation
             found.append(replace(rows, scale=own, rotation=turn, translation=back))
         return replace(self, rows=tuple(found))
@@ -266,7 +270,8 @@ class Residuals(ArrayRecord):
     ) -> Residuals:
         """Those of some of the points, and in a problem that is laid out of some of the
         observations."""
-        place, found = np.where(observations, np.cumsum(observations) - 1, -1), []
+        place = np.where(observations, np.cumsum(observations) - 1, -1)
+        found = []
         for rows in self.rows:
             if len(rows.observation):
                 own = place[np.asarray(rows.observation)]
@@ -278,7 +283,10 @@ class Residuals(ArrayRecord):
                     np.all([(own < 0) | np.isin(own, points) for own in rows.points], axis=0)
                 )
             pairs = zip(rows.residual.unknowns, rows.index, strict=True)
-            of_point = lambda name: name.removesuffix(SECOND) == POINT
+
+            def of_point(name):
+                return name.removesuffix(SECOND) == POINT
+
             index = (
                 np.searchsorted(points, i).astype(np.int32) if of_point(name) else i
                 for name, i in pairs
@@ -295,7 +303,8 @@ def with_rows(
 
     Raises ValueError: a block is missing, there already, or no matrix of finite numbers; or an
     index is out of range."""
-    blocks, name = dict(zip(residuals.names, residuals.blocks, strict=True)), rows.residual.name
+    blocks = dict(zip(residuals.names, residuals.blocks, strict=True))
+    name = rows.residual.name
     for own, value in unknowns.items():
         if own in counts or own in blocks or own.endswith(SECOND):
             raise ValueError(f"a new unknown may not be named {own}")

@@ -174,7 +174,8 @@ def first_of_group(
 ) -> Int[np.ndarray, " cameras"]:
     """For each camera the first chosen one of its group; itself if there is none."""
     known, first = np.unique(group[chosen], return_index=True)
-    at, found = np.isin(group, known), np.arange(len(group))
+    at = np.isin(group, known)
+    found = np.arange(len(group))
     found[at] = chosen[first[np.searchsorted(known, group[at])]]
     return found
 
@@ -188,7 +189,8 @@ def with_unseen_of_frames(
     unseen = np.setdiff1d(np.flatnonzero(of != np.arange(len(cameras))), seen)
     if not len(unseen):
         return cameras
-    rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
+    rotation = np.asarray(rigs.rotation)
+    translation = np.asarray(rigs.translation)
     frames = frame_poses(rotation, translation, cameras)
     found = np.array(cameras)
     found[unseen, :6] = poses_in_frames(

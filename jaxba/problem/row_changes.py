@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 
 from jaxba.problem.bundle_problem import BundleProblem
@@ -18,7 +17,8 @@ from jaxba.problem.row_value import Cameras, value
 from jaxba.rotations import rotation_matrix
 from jaxba.runtime.numerics import numerics
 
-SIMILARITY, OF_ROW = 7, 18
+SIMILARITY = 7
+OF_ROW = 18
 """Numbers of a similarity, and of two poses and two points."""
 
 
@@ -44,8 +44,10 @@ def _changes(
     middle: Float[np.ndarray, "3"],
     extent: float,
 ) -> Float[np.ndarray, "numbers 7"]:
-    own, lenses = np.maximum(np.stack(owners.cameras, axis=1), 0), problem.lenses
-    at, shape = np.asarray(problem.cameras, np.float64)[own.ravel()], own.shape
+    own = np.maximum(np.stack(owners.cameras, axis=1), 0)
+    lenses = problem.lenses
+    at = np.asarray(problem.cameras, np.float64)[own.ravel()]
+    shape = own.shape
     models = (BAL,) if lenses is None else lenses.models
     model = (
         np.zeros(shape, int)
@@ -60,18 +62,14 @@ def _changes(
         np.repeat((none if own is None else own[i])[:, None], 2, axis=1) for own, i in at_rows
     ]
 
-    def moved(
-        change: Array,
-        rotation: Array,
-        center: Array,
-        lens: Array,
-        model: Array,
-        points: Array,
-        *rest: Array,
-    ):
-        scene, own = change[:SIMILARITY], change[SIMILARITY:].reshape(-1, 3)
+    def moved(change, rotation, center, lens, model, points, *rest):
+        scene = change[:SIMILARITY]
+        own = change[SIMILARITY:].reshape(-1, 3)
         turn = rotation_matrix(scene[:3, None])[:, :, 0]
-        move = lambda x: middle + (1 + scene[6]) * (x - middle) @ turn.T + extent * scene[3:6]
+
+        def move(x):
+            return middle + (1 + scene[6]) * (x - middle) @ turn.T + extent * scene[3:6]
+
         turns = jnp.moveaxis(rotation_matrix(own[: len(rotation)].T), 2, 0)
         rotation = turns @ rotation @ turn.T
         center = move(center) + extent * own[2 : 2 + len(center)]

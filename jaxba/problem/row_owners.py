@@ -22,7 +22,9 @@ class Owners(NamedTuple):
 def block_groups(problem: BundleProblem) -> list[Int[np.ndarray, " cameras"]]:
     """For each block of residuals the row that each camera has, negative and different where it has
     none. Raises ProblemError: see `owners_of`."""
-    residuals, count, found = problem.residuals, problem.num_cameras, []
+    residuals = problem.residuals
+    count = problem.num_cameras
+    found = []
     if residuals.groups:
         return [np.asarray(group) for group in residuals.groups]
     for name, block in zip(residuals.names, residuals.blocks, strict=True):
@@ -46,7 +48,8 @@ def block_groups(problem: BundleProblem) -> list[Int[np.ndarray, " cameras"]]:
 def _named_camera(problem: BundleProblem, rows: Rows, ending: str) -> Int[np.ndarray, " rows"]:
     """The camera of each row that a pose, a lens or a block with a row for each camera names; -1
     for none."""
-    residuals, count = problem.residuals, problem.num_cameras
+    residuals = problem.residuals
+    count = problem.num_cameras
     lens = np.arange(count) if problem.lenses is None else np.asarray(problem.lenses.index)
     first = np.full(count if problem.lenses is None else len(problem.lenses.free), -1)
     first[lens[::-1]] = np.arange(count)[::-1]
@@ -81,7 +84,9 @@ def owners_of(
     """Cameras and points that stand for rows, for the `block_groups` of the problem. Raises
     ProblemError: unknowns of a row are not of one camera, or a row has more than can be laid
     out."""
-    names, cameras, blocks = rows.residual.unknowns, [], problem.residuals.names
+    names = rows.residual.unknowns
+    cameras = []
+    blocks = problem.residuals.names
     of_cameras = (name for name in names if name.removesuffix(SECOND) != POINT)
     for ending in dict.fromkeys(SECOND * name.endswith(SECOND) for name in of_cameras):
         camera = _named_camera(problem, rows, ending)

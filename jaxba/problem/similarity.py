@@ -39,7 +39,8 @@ class Similarity(NamedTuple):
 def upright(problem: BundleProblem) -> Similarity:
     """The similarity to a scene around the origin, of a size of about one, with cameras' mean up
     along +z."""
-    poses, points = camera_poses(problem.cameras), np.asarray(problem.points)
+    poses = camera_poses(problem.cameras)
+    points = np.asarray(problem.points)
     places = np.concatenate([poses[:, :, 3], points])
     places = places[np.isfinite(places).all(axis=1)]
     middle = np.median(points if len(points) else places, axis=0)
@@ -88,10 +89,13 @@ def umeyama(
     if len(source) < 3:
         raise ProblemError(f"an alignment needs 3 poses, not {len(source)}")
     shares = np.full(len(source), 1 / len(source)) if weights is None else weights / weights.sum()
-    mean_source, mean_target = shares @ source, shares @ target
-    a, b = source - mean_source, target - mean_target
+    mean_source = shares @ source
+    mean_target = shares @ target
+    a = source - mean_source
+    b = target - mean_target
     with np.errstate(over="ignore", invalid="ignore"):
-        covariance, square = (shares[:, None] * b).T @ a, shares @ (a * a).sum(axis=1)
+        covariance = (shares[:, None] * b).T @ a
+        square = shares @ (a * a).sum(axis=1)
     if not (np.isfinite(covariance).all() and np.isfinite(square)):
         raise ProblemError(
             "the trajectories cannot be aligned: positions are too far apart to be squared"
@@ -116,7 +120,8 @@ def along_line(
     rotation, without a turn about it. Arguments as for `umeyama`; the points of neither may be at
     one place."""
     shares = weights / weights.sum()
-    mean_source, mean_target = shares @ source, shares @ target
+    mean_source = shares @ source
+    mean_target = shares @ target
     a = source - mean_source
     line = np.linalg.svd(np.sqrt(shares)[:, None] * a, full_matrices=False)[2][0]
     along = a @ line

@@ -163,7 +163,9 @@ def _refined(
     full_step: Bool[Array, ""],
 ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
     """The points after embedded iterations, if there are any, and the terms of the cost there."""
-    layout, loss, refinement = against.layout, against.options.loss, against.options.refinement
+    layout = against.layout
+    loss = against.options.loss
+    refinement = against.options.refinement
     if not refinement.points:
         return points, observation_costs(layout, cameras, points, loss)
     arguments = (

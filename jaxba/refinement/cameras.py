@@ -38,14 +38,17 @@ def refine_cameras(
     products = sum_over_devices(
         layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
     )
-    blocks, gradient = products[:, :, :width], products[:, :, width]
+    blocks = products[:, :, :width]
+    gradient = products[:, :, width]
     unknowns = layout.unknowns
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
+
     # not fused with its uses: XLA would recompute the sums in each of them
-    each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
-    own_cost = lambda costs: sum_over_devices(
-        layout, compute_unfused(each_sum, costs, index=layout.slot_camera)
-    )
+    def each_sum(costs):
+        return tree_sum(costs[:, None], layout.camera_levels)[:, 0]
+
+    def own_cost(costs):
+        return sum_over_devices(layout, compute_unfused(each_sum, costs, index=layout.slot_camera))
 
     before = own_cost(linear.reference.costs)
 
@@ -62,6 +65,10 @@ def refine_cameras(
         return jnp.where(better, trial, best), done | better, attempt_number + 1
 
     # a loop instead of unrolled attempts: half as much to compile
-    dampings, unseen = jnp.asarray(DAMPINGS, cameras.dtype), ~jnp.asarray(layout.camera_seen)
-    more = lambda carry: (carry[2] < len(DAMPINGS)) & ~jnp.all(carry[1])
+    dampings = jnp.asarray(DAMPINGS, cameras.dtype)
+    unseen = ~jnp.asarray(layout.camera_seen)
+
+    def more(carry):
+        return (carry[2] < len(DAMPINGS)) & ~jnp.all(carry[1])
+
     return loops.while_loop(more, attempt, (cameras, unseen, jnp.zeros((), jnp.int32)))[0]

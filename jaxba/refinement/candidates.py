@@ -85,11 +85,13 @@ def best_candidate(against: Comparison) -> Candidate:
         return _assess_next(against, start, start.cameras)
 
     def advance(search: Search) -> Search:
-        last, refined = search.candidate, search.cameras
+        last = search.candidate
+        refined = search.cameras
         if options.refinement.camera_rounds:
-            refine = lambda cameras, points: refine_cameras(
-                against.layout, cameras, points, options
-            )
+
+            def refine(cameras, points):
+                return refine_cameras(against.layout, cameras, points, options)
+
             refined = loops.run_if(
                 search.refining, refine, (last.cameras, last.points), last.cameras
             )
@@ -112,9 +114,14 @@ def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
     What it adds are NumPy's arrays: outside of a program each conversion by JAX is a program.
     Cameras [9, cameras] and points [3, points] are the current ones: arrays, or their shapes and
     types. `cost` is theirs, pixels^2, and `step` the solution of the damped system."""
-    constant = lambda value, dtype: cast(Array, np.full(cost.shape, value, dtype))
-    one, infinite = constant(1, cost.dtype), constant(np.inf, cost.dtype)
-    yes, no = constant(1, bool), constant(0, bool)
+
+    def constant(value, dtype):
+        return cast(Array, np.full(cost.shape, value, dtype))
+
+    one = constant(1, cost.dtype)
+    infinite = constant(np.inf, cost.dtype)
+    yes = constant(1, bool)
+    no = constant(0, bool)
     initial = Candidate(cameras, points, infinite, -one, -infinite, no, one, constant(-1, np.int32))
     return Search(
         initial,
@@ -142,7 +149,8 @@ def _assess_next(
     points = search.points + search.length * search.direction[1]
     fraction = jnp.where(best.accepted, best.step_fraction, search.length)
     full_step = _is_full_step(search) & search.active
-    last, refining = search.candidate, search.refining
+    last = search.candidate
+    refining = search.refining
     cameras, points, fraction, repairs = select(
         refining,
         (refined, last.points, last.step_fraction, last.repairs),
@@ -172,7 +180,8 @@ def next_search(
 
 def _after_candidate(against: Comparison, search: Search) -> Search:
     """What to try after a candidate that has had its camera rounds."""
-    best, candidate = search.best, search.candidate
+    best = search.best
+    candidate = search.candidate
     first = candidate.accepted & ~best.accepted
     better = candidate.accepted & best.accepted & (candidate.cost < best.cost)
     tried = best._replace(repairs=jnp.where(search.active, candidate.repairs, best.repairs))

@@ -57,19 +57,20 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
         undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1] + 1
     )
     camera_ray = [undistorted[0] * inverse_norm, undistorted[1] * inverse_norm, -inverse_norm]
-    to_world = lambda vector: [
-        sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)
-    ]
+
+    def to_world(vector):
+        return [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
+
     offset = list(frame.translation)
     for place in frame.places:  # first from the camera to its frame
-        back = lambda vector, place=place: [
-            sum(place[3 * j + i] * vector[j] for j in range(3)) for i in range(3)
-        ]
-        camera_ray, offset = (
-            back(camera_ray),
-            [t + b for t, b in zip(offset, back(place[9:]), strict=True)],
-        )
-    ray, center = to_world(camera_ray), [-x for x in to_world(offset)]
+
+        def back(vector, place=place):
+            return [sum(place[3 * j + i] * vector[j] for j in range(3)) for i in range(3)]
+
+        camera_ray = back(camera_ray)
+        offset = [t + b for t, b in zip(offset, back(place[9:]), strict=True)]
+    ray = to_world(camera_ray)
+    center = [-x for x in to_world(offset)]
     along = sum(ray[i] * center[i] for i in range(3))
     matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
     right = [center[i] - ray[i] * along for i in range(3)]
@@ -142,7 +143,10 @@ def refine_from_starts(
     The cost of a point has several minima along its rays. Which is the lowest shows only after a
     few iterations. Arguments as there, after the step; `starts`: 0: from `points`; 1: from the
     likelier of these and the midpoints; 2: from both."""
-    choose = lambda *given: choose_starts(layout, given[0], given[1], given[2], loss, given[3])
+
+    def choose(*given):
+        return choose_starts(layout, given[0], given[1], given[2], loss, given[3])
+
     given = cameras, frames, points, previous
     candidates = loops.run_if(starts > 0, choose, given, jnp.stack([points, points]))
 

@@ -127,7 +127,8 @@ def refine_points(
         min_decrease: stop after an iteration that lowers the total cost by at most this (pixels^2)
             and by at most `SMALL_DECREASE` of the cost that is left."""
     one_pass = point_passes(layout, frames)
-    before, alone = previous or PreviousPoints.unknown(layout, points), points_alone(layout)
+    before = previous or PreviousPoints.unknown(layout, points)
+    alone = points_alone(layout)
 
     def terms(views: Views, front: Array) -> list[Array]:
         found = point_terms(views, loss)

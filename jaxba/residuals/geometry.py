@@ -70,8 +70,10 @@ def heading(pose, *, azimuth, north, up, sigma):
     Magnetic azimuths need the declination added."""
     east = jnp.cross(north, up)
     ahead = jnp.cross(up, east) / jnp.sqrt(up @ up)
-    x, y = pose.rotation[2] @ ahead, pose.rotation[2] @ east
-    cos, sin = jnp.cos(azimuth), jnp.sin(azimuth)
+    x = pose.rotation[2] @ ahead
+    y = pose.rotation[2] @ east
+    cos = jnp.cos(azimuth)
+    sin = jnp.sin(azimuth)
     return jnp.arctan2(y * cos - x * sin, x * cos + y * sin) / sigma
 
 

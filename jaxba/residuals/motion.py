@@ -126,11 +126,10 @@ def preintegrated(
             their biases (the same per second).
         bias: of the gyroscope and the accelerometer, about which the result is linear, shape
             (6,)."""
-    t, at = (
-        finite("times", times, (np.size(times),)),
-        finite("moments", moments, (np.size(moments),)),
-    )
-    bias, deviation = finite("bias", bias, (6,)), np.repeat(finite("noise", noise, (4,)), 3)
+    t = finite("times", times, (np.size(times),))
+    at = finite("moments", moments, (np.size(moments),))
+    bias = finite("bias", bias, (6,))
+    deviation = np.repeat(finite("noise", noise, (4,)), 3)
     measured = {"angular_rates": angular_rates, "accelerations": accelerations}
     samples = np.hstack([finite(name, x, (len(t), 3)) for name, x in measured.items()]) - bias
     if (
@@ -148,7 +147,8 @@ def preintegrated(
     knots = [np.unique([a, (a + b) / 2, b, *t[(t > a) & (t < b)]]) for a, b in pairwise(at)]
     longest = max(map(len, knots))
     ends = np.stack([np.pad(one, (0, longest - len(one)), mode="edge") for one in knots])
-    steps, middles = np.diff(ends), (ends[:, 1:] + ends[:, :-1]) / 2
+    steps = np.diff(ends)
+    middles = (ends[:, 1:] + ends[:, :-1]) / 2
     between = np.stack([np.interp(middles, t, column) for column in samples.T], axis=-1)
     with numerics(np.float64):
         by_sample, (rotation, velocity, position) = jax.device_get(_derivatives(between, steps))
@@ -187,7 +187,8 @@ def _integrated(
     def advance(
         state: tuple[Array, Array, Array], of: tuple[Array, Array]
     ) -> tuple[tuple[Array, Array, Array], None]:
-        (rotation, velocity, position), (sample, dt) = state, of
+        (rotation, velocity, position) = state
+        (sample, dt) = of
         half = rotation @ _exponential(0.5 * dt * sample[:3])
         force = half @ sample[3:]
         position = position + dt * (velocity + 0.5 * dt * force)

@@ -37,7 +37,10 @@ class Consecutive:
         waiting: Waiting,
         limit: TimeLimit,
     ) -> None:
-        self._policy, self._callback, self._watch, self._waiting = policy, callback, watch, waiting
+        self._policy = policy
+        self._callback = callback
+        self._watch = watch
+        self._waiting = waiting
         self._limit = limit
         self.done: list[Solution] = []
 
@@ -55,10 +58,8 @@ class Consecutive:
     ) -> Solution:
         """`solve_without`; who watches sees the parameters in `whole`. It runs from Python, so that
         all limits use the same programs."""
-        count, seconds = (
-            sum(one.iterations for one in self.done),
-            sum(one.total_s for one in self.done),
-        )
+        count = sum(one.iterations for one in self.done)
+        seconds = sum(one.total_s for one in self.done)
         watch = self._watch
 
         def of_all(record: IterationRecord) -> IterationRecord:

@@ -125,7 +125,8 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     options = StepOptions(
         linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold")
     )
-    given, (counted, offset, problem) = problem, placed(problem, facing_away(problem))
+    given = problem
+    (counted, offset, problem) = placed(problem, facing_away(problem))
     free = SIMILARITY - fixed_freedoms(counted)
     if free:
         which = (
@@ -159,7 +160,8 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     lost = np.linalg.norm(null, axis=1) > COMPONENT
     of_cameras = np.where(lost[:, None] | lost, np.nan, inverse)
     cameras = np.asarray(given.cameras)
-    seen, index = np.asarray(layout.camera_seen)[: len(cameras)], index[: len(cameras)]
+    seen = np.asarray(layout.camera_seen)[: len(cameras)]
+    index = index[: len(cameras)]
     rotations = geometry.rotation_matrices(cameras[:, :3])
     changes = _changes(problem, layout, rotations, offset)
     pairs = zip(changes, index, strict=True)
@@ -167,7 +169,10 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     poses[~seen] = np.nan
     lenses = _of_lenses(counted, layout.unknowns, seen, index, of_cameras)
     unseen = np.setdiff1d(np.arange(len(lenses)), np.asarray(every_lens(counted).index)[seen])
-    has = lambda x: np.isnan(x).any(axis=(1, 2))
+
+    def has(x):
+        return np.isnan(x).any(axis=(1, 2))
+
     undetermined: dict[Part, np.ndarray] = {
         "image": np.flatnonzero(has(poses) & seen),
         "lens": np.setdiff1d(np.flatnonzero(has(lenses)), unseen),
@@ -221,14 +226,17 @@ def _marginal(
 ) -> tuple[Float[np.ndarray, "points 3 3"], Bool[np.ndarray, "points 3"]]:
     """`C^-1 + C^-1 E^T S^-1 E C^-1` of each point, and the coordinates of points that cameras leave
     undetermined."""
-    count, unknowns = len(system.seen), len(of_cameras)
+    count = len(system.seen)
+    unknowns = len(of_cameras)
     cross = (system.by_point.T @ system.jacobian).tocsr()
     own = np.sqrt(np.asarray(system.jacobian.multiply(system.jacobian).sum(axis=0)).ravel())
     null = null / np.where(own > 0, own, 1.0)[:, None]
-    found, lost = system.inverse.copy(), np.zeros((count, 3), bool)
+    found = system.inverse.copy()
+    lost = np.zeros((count, 3), bool)
     for start in range(0, count if unknowns else 0, CHUNK):
         part = slice(start, start + CHUNK)
-        of_part, given = cross[3 * start : 3 * (start + CHUNK)], system.inverse[part]
+        of_part = cross[3 * start : 3 * (start + CHUNK)]
+        given = system.inverse[part]
         product = np.asarray(of_part @ of_cameras)  # (3 points, unknowns)
         columns = of_part.toarray().reshape(*given.shape[:2], unknowns)
         middle = np.einsum("piu,pju->pij", columns, product.reshape(columns.shape))

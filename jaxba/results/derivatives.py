@@ -167,10 +167,8 @@ def differentiable_solve(
             return (prepared().transposed(inputs, end[0], end[1], cotangents),)
         with numerics(np.float64):
             at = _Prepared.of(end, policy, options, facing_away(_with_inputs(end, inputs)))
-            here, symmetries = (
-                at.setup.placed.here,
-                _symmetries(at.setup.placed.counted, at.setup.layout),
-            )
+            here = at.setup.placed.here
+            symmetries = _symmetries(at.setup.placed.counted, at.setup.layout)
             return (at.transposed(inputs, here.cameras, here.points, cotangents, symmetries),)
 
     find.defvjp(forward, backward)
@@ -178,7 +176,9 @@ def differentiable_solve(
 
 
 def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
-    host = lambda x: np.asarray(x, np.float64)
+    def host(x):
+        return np.asarray(x, np.float64)
+
     pairs = zip(problem.residuals.rows, inputs.residuals, strict=True)
     rows = tuple(replace(one, data=tuple(map(host, data))) for one, data in pairs)
     return problem.replace(
@@ -225,9 +225,11 @@ class _Prepared(NamedTuple):
         self, inputs: SolveInputs
     ) -> tuple[tuple[Array, Array], tuple[SolveInputs, tuple[Array, Array]]]:
         """The solution inside a transformation of JAX, and what `transposed` takes."""
-        setup, (cameras, points) = self.setup, self.setup.start
+        setup = self.setup
+        (cameras, points) = self.setup.start
         model = _Model.of(setup.layout, self.slots, cameras, inputs.points, inputs)
-        layout, limit = model.with_data(inputs), self.options.max_iterations
+        layout = model.with_data(inputs)
+        limit = self.options.max_iterations
         start = state_of(
             layout, model.of_frames(inputs.cameras), inputs.points, setup.options, jnp.float64
         )
@@ -273,7 +275,8 @@ class _Prepared(NamedTuple):
             coordinates=replace(self.setup.options.coordinates, rotation="manifold"),
             conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-10),
         )
-        layout, slots = self.setup.layout, jnp.asarray(self.slots)
+        layout = self.setup.layout
+        slots = jnp.asarray(self.slots)
         symmetries = self.symmetries(cameras, points) if symmetries is None else symmetries
         arguments = (layout, slots, cameras, points, *symmetries, inputs, cotangents)
         found, residual = jit(_solve_transposed, once=True, static_argnames="options")(
@@ -295,14 +298,16 @@ def _symmetries(
     """What leaves the cost as it is: an orthonormal basis of seven directions of the gauge, zero
     for those that are not free, in all numbers of cameras and points; and the directions in which
     rays determine points, in layout order. `fixed`: it is known that none is free."""
-    order, determined = np.asarray(layout.points), determined_directions(solved)
+    order = np.asarray(layout.points)
+    determined = determined_directions(solved)
     cameras, points = free_directions(solved.replace(residuals=Residuals()) if fixed else solved)
     more = layout.num_cameras - solved.num_cameras
     cameras = np.pad(cameras, ((0, 0), (0, more), (0, sum(layout.unknowns.own_sizes))))
     cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
     # only what of it is not already a motion of points along their rays
     points = np.einsum("pij,kpj->kpi", determined, points)
-    real, at = order < solved.num_points, np.minimum(order, solved.num_points - 1)
+    real = order < solved.num_points
+    at = np.minimum(order, solved.num_points - 1)
     points = np.where(real[:, None], points[:, at], 0.0).transpose(0, 2, 1)
     whole = np.hstack([x.reshape(len(x), math.prod(x.shape[1:])) for x in (cameras, points)])
     _, sizes, rows = np.linalg.svd(whole, full_matrices=False)
@@ -357,9 +362,12 @@ class _Model(NamedTuple):
 
     def with_data(self, theta: SolveInputs) -> Layout:
         """The layout with what the inputs measured."""
-        in_slots = lambda x: jnp.where(
-            self.layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., self.slots], 0
-        )
+
+        def in_slots(x):
+            return jnp.where(
+                self.layout.slot_mask, jnp.moveaxis(jnp.asarray(x), 0, -1)[..., self.slots], 0
+            )
+
         here = replace(self.layout, pixels=in_slots(theta.observations))
         if theta.whitening is not None:
             here = replace(here, whitening=in_slots(theta.whitening))
@@ -370,12 +378,14 @@ class _Model(NamedTuple):
 
     def of_frames(self, cameras: AnyArray) -> Array:
         """Cameras as the inputs have them, as those of the state."""
-        state, end = self.cameras, self.end
+        state = self.cameras
+        end = self.end
         cameras = jnp.concatenate([cameras, state[: cameras.shape[1], len(cameras) :].T])
         if not self.layout.unknowns.in_rigs:
             return jnp.concatenate([cameras, state[end:].T], axis=1)
         place = state[end - EXTRINSICS_SIZE : end]
-        turn, rows = rotation_matrix(place[:3]), jnp.asarray(cameras).T
+        turn = rotation_matrix(place[:3])
+        rows = jnp.asarray(cameras).T
         moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
         return jnp.concatenate(
             [compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place, state[end:]]
@@ -415,7 +425,9 @@ def _solve_transposed(
     options: StepOptions,
 ) -> tuple[SolveInputs, Array]:
     model = _Model.of(layout, slots, cameras, points, inputs)
-    unknowns, order, zero = layout.unknowns, layout.points, model.zero
+    unknowns = layout.unknowns
+    order = layout.points
+    zero = model.zero
     seen = jnp.asarray(layout.camera_seen)[:, None] & (
         jnp.arange(len(zero[0]))[:, None] < model.given
     )
@@ -437,17 +449,22 @@ def _solve_transposed(
     _, pull = jax.vjp(lambda y: found(y, inputs), zero)
     of_points = jnp.where(order < model.real, 1.0, 0.0)
     by_points = of_points * cotangents[1].T[:, jnp.minimum(order, model.real - 1)]
-    size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
+
+    def size(y):
+        return jnp.sqrt(sum(jnp.sum(part * part) for part in y))
+
     (whole,) = pull((cotangents[0].T, by_points))
     # where all of it is along the orbit, what is left is rounding
-    right, whole = project(whole), size(whole)
+    right = project(whole)
+    whole = size(whole)
 
     def along(y: tuple[Array, Array], theta: SolveInputs, step: tuple[Array, Array]) -> Array:
         """The slope of the cost along a step. Its gradient by y is H step, and by theta step .
         dg/dtheta."""
-        objective = lambda y: cost(
-            model.with_data(theta), *model.moved(y, theta, determined), options.loss
-        )
+
+        def objective(y):
+            return cost(model.with_data(theta), *model.moved(y, theta, determined), options.loss)
+
         return jax.jvp(objective, (y,), (step,))[1]
 
     def product(y: tuple[Array, Array]) -> tuple[tuple[Array, Array], SolveInputs]:
@@ -456,7 +473,10 @@ def _solve_transposed(
 
     inverse = _gauss_newton(model.with_data(inputs), model.cameras, model.points, options)
     tolerance = TOLERANCE * whole
-    preconditioner = lambda y: project(inverse(project(y)))
+
+    def preconditioner(y):
+        return project(inverse(project(y)))
+
     left, through = _conjugate_gradients(product, right, preconditioner, tolerance, inputs)
     # dL/dtheta = -w . dg/dtheta, and what of the solution is constant passes directly
     direct = jax.vjp(lambda theta: found(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]

@@ -42,7 +42,9 @@ from jaxba.solver.solve import Solution
 from jaxba.solver.start import as_measured
 from jaxba.solver.time_limit import TimeLimit
 
-STAGES, STAGE_ITERATIONS, STAGE_FTOL = 40, 5, 1e-3
+STAGES = 40
+STAGE_ITERATIONS = 5
+STAGE_FTOL = 1e-3
 """Most stages, and limit and `ftol` of each."""
 
 FEWEST = 0.25
@@ -150,7 +152,8 @@ def _descend(
     # far points would make every step short
     tolerances = options.tolerances._replace(ftol=STAGE_FTOL, xtol=0.0)
     options = replace(options, loss=Loss(), max_iterations=limit, tolerances=tolerances)
-    counted, good = ~np.isin(problem.camera_index, away), np.ones(problem.num_observations, bool)
+    counted = ~np.isin(problem.camera_index, away)
+    good = np.ones(problem.num_observations, bool)
     floor = last or LAST * _median(problem, good, counted)
     for _ in range(STAGES if limit and not solves.stopped else 0):
         root = np.maximum(1 / (1 + (_distances(problem, good) / scale) ** 2), LEAST_WEIGHT)
@@ -158,7 +161,8 @@ def _descend(
         found = solves.solve(
             away, problem.replace(whitening=root[:, None, None] * own), options, problem
         )
-        problem, good = with_parameters(problem, found.problem), 2 * root > 1
+        problem = with_parameters(problem, found.problem)
+        good = 2 * root > 1
         floor = last or LAST * _median(problem, good, counted)
         if solves.stopped or (found.converged and floor > 0.95 * scale):
             break
@@ -191,7 +195,8 @@ def _fitting(
 ) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " lost"]]:
     """Observations that fit, and the images that have too few of them."""
     front = ~views_behind(problem)
-    views, lost = np.bincount(problem.camera_index, minlength=problem.num_cameras), NO_CAMERAS
+    views = np.bincount(problem.camera_index, minlength=problem.num_cameras)
+    lost = NO_CAMERAS
     kept = np.ones(problem.num_observations, bool)
     for _ in range(3):  # the second time by how many do fit, the last time without lost images
         kept = (_distances(problem, kept) <= scale) & front & ~np.isin(problem.camera_index, lost)
@@ -217,7 +222,8 @@ def _posed_again(
 ) -> BundleProblem:
     """The problem with images at the poses that right points give them, from the pose of an image
     that shares them."""
-    camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    camera = np.asarray(problem.camera_index)
+    point = np.asarray(problem.point_index)
     cameras = np.array(problem.cameras)
     for image in lost:
         shared = np.bincount(

@@ -125,7 +125,8 @@ def retriangulate_without(
         process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(before):
         raise ProblemError(explain_start(problem, loss))
-    points, moved = np.array(problem.points, np.float64), np.asarray(moved) & real
+    points = np.array(problem.points, np.float64)
+    moved = np.asarray(moved) & real
     points[order[moved]] = np.asarray(found).T[moved] + offset
     return Retriangulation(
         problem.replace(points=points), int(moved.sum()), float(before), float(after)
@@ -138,7 +139,8 @@ def _search(
     """`retriangulate` in layout order, with the centre of the first camera of each point as
     `origin`, scene units: points, which of them moved, and the cost before and after."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
-    frames, start = slot_frames(layout, state.cameras), state.points
+    frames = slot_frames(layout, state.cameras)
+    start = state.points
     one_pass = point_passes(layout, frames)
 
     def terms(views: Views) -> list[Array]:
@@ -150,7 +152,8 @@ def _search(
         costs, hidden = one_pass(points, terms)
         return add_point_terms(layout, state.cameras, points, [costs])[0], hidden
 
-    (own, hidden), alone = evaluate(start), points_alone(layout)
+    (own, hidden) = evaluate(start)
+    alone = points_alone(layout)
 
     def try_start(
         best: tuple[Array, Array], position: Float[Array, "3 points"]

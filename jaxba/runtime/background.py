@@ -38,9 +38,10 @@ class Wanted(NamedTuple):
 
 def outline(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     """The arguments with shapes and types in the place of arrays."""
-    typed = lambda x: jax.ShapeDtypeStruct(
-        x.shape, x.dtype, weak_type=getattr(x, "weak_type", False)
-    )
+
+    def typed(x):
+        return jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=getattr(x, "weak_type", False))
+
     return jax.tree.map(lambda x: typed(x) if hasattr(x, "dtype") else x, arguments)
 
 

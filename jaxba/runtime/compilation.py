@@ -176,7 +176,8 @@ class ParallelCompilation:
             self(function, *arguments)
 
     def _begin(self, function: Program, *arguments: Any) -> Any:
-        cache, path = None if jax.config.values.get("jax_compilation_cache_dir") else _cache, None
+        cache = None if jax.config.values.get("jax_compilation_cache_dir") else _cache
+        path = None
         if cache is not None:
             path = self.path(function, *arguments)
             if (stored := cache.load(path)) is not None:

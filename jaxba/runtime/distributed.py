@@ -93,7 +93,9 @@ def _deadline(seconds: float) -> Iterator[None]:
         )
         os._exit(2)
 
-    say = lambda: print("note: waiting for the other processes", file=sys.stderr, flush=True)
+    def say():
+        return print("note: waiting for the other processes", file=sys.stderr, flush=True)
+
     timers = threading.Timer(PATIENCE_S, say), threading.Timer(seconds, give_up)
     for timer in timers:
         timer.daemon = True
@@ -152,7 +154,10 @@ def use_devices(count: int | None) -> list[jax.Device]:
     if count is not None and len(found) < count:
         kind = found[0].platform.upper()
         raise InputError(f"{count} devices asked for, {len(found)} of kind {kind} found")
-    own = lambda process: [x for x in jax.devices() if x.process_index == process][:count]
+
+    def own(process):
+        return [x for x in jax.devices() if x.process_index == process][:count]
+
     return [device for process in range(jax.process_count()) for device in own(process)]
 
 
@@ -186,7 +191,8 @@ def together(work: Callable[[], T]) -> T:
         if not found:
             raise MainFailedError
         return pickle.loads(found, buffers=buffers)
-    content, buffers = b"", []
+    content = b""
+    buffers = []
     try:
         result = work()
         arrays: list[pickle.PickleBuffer] = []  # of NumPy, which are sent as they are

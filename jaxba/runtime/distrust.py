@@ -45,7 +45,8 @@ def programs_folder(parent: Path) -> Path:
         platform.node()
     ]
     name = hashlib.sha256("\n".join([jaxlib.__version__, *features]).encode()).hexdigest()[:16]
-    folder, flags = parent / name, os.environ.get("XLA_FLAGS", "")
+    folder = parent / name
+    flags = os.environ.get("XLA_FLAGS", "")
     folder.mkdir(parents=True, exist_ok=True)
     if FLAG in flags:
         return folder

@@ -88,10 +88,13 @@ class ExecutableCache:
         try:
             leaves, tree = jax.tree.flatten(arguments)
             key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
-            weak = lambda leaf: "weak" if getattr(leaf, "weak_type", False) else ""
-            typed = lambda x: (
-                f"{x.dtype}{x.shape}{weak(x)}" if hasattr(x, "dtype") else type(x).__name__
-            )
+
+            def weak(leaf):
+                return "weak" if getattr(leaf, "weak_type", False) else ""
+
+            def typed(x):
+                return f"{x.dtype}{x.shape}{weak(x)}" if hasattr(x, "dtype") else type(x).__name__
+
             key += map(typed, leaves)
         except _UnknownSource:
             return None
@@ -154,13 +157,15 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
     """Gives a function that tells whether this thread has compiled a program within the context.
 
     False where JAX read the program from its own cache instead."""
-    thread, events = threading.get_ident(), set()
+    thread = threading.get_ident()
+    events = set()
 
     def listen(event: str, *_: Any, **__: Any) -> None:
         if threading.get_ident() == thread:
             events.add(event)
 
-    hit, done = "/jax/compilation_cache/cache_hits", "/jax/core/compile/backend_compile_duration"
+    hit = "/jax/compilation_cache/cache_hits"
+    done = "/jax/core/compile/backend_compile_duration"
     monitoring.register_event_listener(listen)
     monitoring.register_event_duration_secs_listener(listen)
     try:
@@ -184,8 +189,10 @@ def _load(path: Path) -> CachedExecutable:
     reading = _readers.submit(
         device.client.deserialize_executable, code, executable_devices=devices
     )
+
     # all arrays are on this device
-    put = lambda x: x if isinstance(x, jax.Array) else jax.device_put(x, device)
+    def put(x):
+        return x if isinstance(x, jax.Array) else jax.device_put(x, device)
 
     def run(*arguments: Any) -> Any:
         results = reading.result().execute_sharded([put(x) for x in jax.tree.leaves(arguments)])
@@ -231,7 +238,8 @@ class _UnknownSource(Exception):
 
 def _name(thing: Any) -> str:
     """Name of a function or class whose source is known."""
-    module, name = thing.__module__, thing.__qualname__
+    module = thing.__module__
+    name = thing.__qualname__
     if module.split(".")[0] not in ("jaxba", "builtins") or "<" in name:
         raise _UnknownSource(f"{module}.{name}")
     return f"{module}.{name}"

@@ -33,9 +33,10 @@ def fusion_barrier(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
     its sine once per observation. On a CPU `optimization_barrier` is dropped before fusion, so
     there an exact product with the unit matrix stands in for it: products are never fused. A
     non-finite entry spoils its column."""
-    times_identity = lambda rows: jnp.matmul(
-        jnp.eye(len(rows), dtype=rows.dtype), rows, precision="highest"
-    )
+
+    def times_identity(rows):
+        return jnp.matmul(jnp.eye(len(rows), dtype=rows.dtype), rows, precision="highest")
+
     return lax.platform_dependent(rows, cpu=times_identity, default=lax.optimization_barrier)
 
 
@@ -58,7 +59,10 @@ def compute_unfused(
         )
 
     taken = jnp.reshape(jnp.asarray(index), -1)[0] >= 0
-    branch = lambda *operands: lax.cond(taken, function, never, *operands)
+
+    def branch(*operands):
+        return lax.cond(taken, function, never, *operands)
+
     return lax.platform_dependent(*operands, cpu=branch, default=function)
 
 
@@ -89,7 +93,9 @@ def compute_in_one_loop(function: Callable[..., list[Array]], *operands: Any) ->
     that several vectors are made of, is better stored before (`fusion_barrier`)."""
 
     def one_loop(*operands: Any) -> list[Array]:
-        twice = lambda x: jnp.broadcast_to(jnp.expand_dims(x, -2), (*x.shape[:-1], 2, x.shape[-1]))
+        def twice(x):
+            return jnp.broadcast_to(jnp.expand_dims(x, -2), (*x.shape[:-1], 2, x.shape[-1]))
+
         rows = function(*jax.tree.map(twice, operands))
         # one loop anyway, and XLA hands a sum of one operand to a library, which is slow
         if len(rows) == 1:
@@ -104,5 +110,8 @@ def compute_in_one_loop(function: Callable[..., list[Array]], *operands: Any) ->
 
 def sum_in_one_loop(rows: list[Array], axis: int) -> list[Array]:
     """Sums of several arrays of one shape over an axis, all in one loop."""
-    add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
+
+    def add(left, right):
+        return [a + b for a, b in zip(left, right, strict=True)]
+
     return lax.reduce(rows, [jnp.zeros((), row.dtype) for row in rows], add, (axis,))

@@ -33,7 +33,10 @@ def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None)
     def more_groups(size: int, batched: Any, shared: Any, arguments: Any) -> tuple[T, Any]:
         if any(jax.tree.leaves(batched[0])):
             raise ValueError("arrays that all scenes share must not be batched")
-        whole = lambda x, own: x if own else jnp.broadcast_to(x, (size, *x.shape))
+
+        def whole(x, own):
+            return x if own else jnp.broadcast_to(x, (size, *x.shape))
+
         flat = jax.tree.map(lambda x, own: _joined(whole(x, own)), arguments, batched[1])
         found = _grouped(function, shared, flat)
         found = jax.tree.map(lambda x: x.reshape(size, len(x) // size, *x.shape[1:]), found)

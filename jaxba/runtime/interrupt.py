@@ -43,19 +43,23 @@ class Interrupt:
         """Does nothing yet. `unit` is what is finished after the first signal, for the message,
         e.g. `iteration`. Without it, signals that have a handler already are left alone. `graceful`
         can be changed later."""
-        self.unit, self.graceful, self.requested = unit, graceful, False
+        self.unit = unit
+        self.graceful = graceful
+        self.requested = False
         # signals that the thread and the handler have seen; Python calls the handler once for
         # several signals
-        self._received, self._handled = 0, 0
+        self._received = 0
+        self._handled = 0
         self._message = [True]  # empty when the message has been printed
         self._sender: socket.socket | None = None
 
     def __enter__(self) -> Interrupt:
         main_thread = threading.current_thread() is threading.main_thread()
         unhandled = (signal.default_int_handler, signal.SIG_DFL)
-        replaces = lambda handler: (
-            handler in unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
-        )
+
+        def replaces(handler):
+            return handler in unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
+
         ours = [number for number in SIGNALS if main_thread and replaces(signal.getsignal(number))]
         self._previous = {number: signal.signal(number, self._handle) for number in ours}
         self._previous_hook, sys.unraisablehook = (

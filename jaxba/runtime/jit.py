@@ -62,7 +62,8 @@ class jit:
         hardly optimised."""
         functools.update_wrapper(self, function)
         self._part = jax.jit(function, **settings)
-        self._settings, self._once = settings, once
+        self._settings = settings
+        self._once = once
 
     @functools.cached_property
     def _whole(self) -> Any:  # only now: JAX's backend must not start when a module is imported

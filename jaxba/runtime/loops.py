@@ -27,8 +27,11 @@ def while_loop(
     condition: Callable[[Carry], Any], body: Callable[[Carry], Carry], start: Carry
 ) -> Carry:
     """`jax.lax.while_loop`, never taken for a small loop."""
+
     # the condition reads the counter, or XLA would remove it with its sort
-    more = lambda loop: condition(loop[1]) & (loop[0] >= 0)
+    def more(loop):
+        return condition(loop[1]) & (loop[0] >= 0)
+
     return lax.while_loop(
         more, lambda loop: (_next(loop[0]), body(loop[1])), (jnp.zeros((), jnp.int32), start)
     )[1]
@@ -41,7 +44,10 @@ def fori_loop(
     start: Carry,
 ) -> Carry:
     """`jax.lax.fori_loop`, never taken for a small loop."""
-    advance = lambda loop: (_next(loop[0]), body(loop[0], loop[1]))
+
+    def advance(loop):
+        return (_next(loop[0]), body(loop[0], loop[1]))
+
     begin = jnp.asarray(first, jnp.int32)
     return lax.while_loop(lambda loop: loop[0] < end, advance, (begin, start))[1]
 
@@ -72,9 +78,10 @@ def map_rows(
     axis, at least one entry long. It is applied to `used` entries, the others giving zero; None: to
     all. With a number there are no reverse derivatives."""
     count = jax.tree.leaves(rows)[0].shape[0]
-    at = lambda k: jax.tree.map(
-        lambda all_: lax.dynamic_index_in_dim(all_, k, keepdims=False), rows
-    )
+
+    def at(k):
+        return jax.tree.map(lambda all_: lax.dynamic_index_in_dim(all_, k, keepdims=False), rows)
+
     if used is None:  # a scan, for reverse differentiation
         return lax.scan(
             lambda k, _: (_next(k), function(at(k))), jnp.zeros((), jnp.int32), length=count
@@ -84,7 +91,9 @@ def map_rows(
     )
 
     def body(k: Array, results: Any) -> Any:
-        put = lambda all_, one: lax.dynamic_update_index_in_dim(all_, one, k, 0)
+        def put(all_, one):
+            return lax.dynamic_update_index_in_dim(all_, one, k, 0)
+
         return jax.tree.map(put, results, function(at(k)))
 
     return fori_loop(0, used, body, results)
@@ -92,5 +101,8 @@ def map_rows(
 
 def _next(counter: Int[Array, ""]) -> Int[Array, ""]:
     """The counter plus one, by way of a sort on a CPU."""
-    by_sort = lambda n: lax.sort(jnp.stack([n, n + 1]))[1]
+
+    def by_sort(n):
+        return lax.sort(jnp.stack([n, n + 1]))[1]
+
     return lax.platform_dependent(counter, cpu=by_sort, default=lambda n: n + 1)

@@ -66,7 +66,10 @@ def in_turns(
     shapes = [
         jax.ShapeDtypeStruct(x.shape[one:], x.dtype) for x, one in zip(given, apart, strict=True)
     ]
-    flat = lambda *each: function(*jax.tree.unflatten(tree, each))
+
+    def flat(*each):
+        return function(*jax.tree.unflatten(tree, each))
+
     program, out = jax.make_jaxpr(flat, axis_env=[(axis, parts)], return_shape=True)(*shapes)
     graph = _Graph(axis, parts)
     found = graph.built(program, [given_value(x, one) for x, one in zip(given, apart, strict=True)])
@@ -84,32 +87,37 @@ class _Graph:
     """The equations of a program, those of called functions among them."""
 
     def __init__(self, axis: str, parts: int) -> None:
-        self._axis, self._parts = axis, parts
+        self._axis = axis
+        self._parts = parts
 
     def built(self, program: Any, inputs: Sequence[Value]) -> list[Value]:
         """The results of a program on these inputs; nothing is computed yet."""
-        jaxpr, constants = program.jaxpr, [given_value(x, False) for x in program.consts]
+        jaxpr = program.jaxpr
+        constants = [given_value(x, False) for x in program.consts]
         known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
-        read = lambda atom: (
-            given_value(atom.val, False) if isinstance(atom, Literal) else known[atom]
-        )
+
+        def read(atom):
+            return given_value(atom.val, False) if isinstance(atom, Literal) else known[atom]
+
         for equation in jaxpr.eqns:
             found = self._of(equation, [read(atom) for atom in equation.invars])
             known.update(zip(equation.outvars, found, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
     def _of(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        name, params = equation.primitive.name, equation.params
-        level, divided = (
-            max((one.node.level for one in inputs), default=0),
-            [one.divided for one in inputs],
-        )
+        name = equation.primitive.name
+        params = equation.params
+        level = max((one.node.level for one in inputs), default=0)
+        divided = [one.divided for one in inputs]
         if name in _CALLS:
             return self.built(params["jaxpr" if "jaxpr" in params else "call_jaxpr"], inputs)
         # a result for each input, common ones of common inputs alone
         if name == "optimization_barrier":
             common_ones = [one for one in inputs if not one.divided]
-            tied = lambda one: [one, *common_ones]
+
+            def tied(one):
+                return [one, *common_ones]
+
             return [Value(Node(equation, tied(one), level), 0, one.divided) for one in inputs]
         collective = _sums(equation, self._axis)
         node = Node(equation, inputs, level + collective, collective=collective)
@@ -193,7 +201,10 @@ class _Graph:
             # a kernel that also writes into a larger array would run on one core
             found, rows = compute_unfused(part, number, index=number)
             totals = [add(a, b) for add, a, b in zip(adds, carry[0], found, strict=True)]
-            put = lambda every, row: lax.dynamic_update_index_in_dim(every, row, number, 0)
+
+            def put(every, row):
+                return lax.dynamic_update_index_in_dim(every, row, number, 0)
+
             return totals, [put(every, row) for every, row in zip(carry[1], rows, strict=True)]
 
         adds = [_SUMS[node.name] for node in sums for _ in node.inputs]
@@ -216,14 +227,21 @@ class _Graph:
     def _loop(self, node: Node) -> list[Any]:
         """The state after a loop."""
         params = node.params
-        beside, start = node.inputs[: _constants(params)], node.inputs[_constants(params) :]
-        ahead, beside = beside[: params["cond_nconsts"]], beside[params["cond_nconsts"] :]
+        beside = node.inputs[: _constants(params)]
+        start = node.inputs[_constants(params) :]
+        ahead = beside[: params["cond_nconsts"]]
+        beside = beside[params["cond_nconsts"] :]
         prepared(node.inputs)
-        state = lambda carry: [
-            given_value(x, apart) for x, apart in zip(carry, node.divided, strict=True)
-        ]
-        more = lambda carry: self._run(params["cond_jaxpr"], [*ahead, *state(carry)], [False])[0]
-        body = lambda carry: self._run(params["body_jaxpr"], [*beside, *state(carry)], node.divided)
+
+        def state(carry):
+            return [given_value(x, apart) for x, apart in zip(carry, node.divided, strict=True)]
+
+        def more(carry):
+            return self._run(params["cond_jaxpr"], [*ahead, *state(carry)], [False])[0]
+
+        def body(carry):
+            return self._run(params["body_jaxpr"], [*beside, *state(carry)], node.divided)
+
         return lax.while_loop(
             more, body, [self._apart(*one) for one in zip(start, node.divided, strict=True)]
         )

@@ -122,7 +122,8 @@ def check(config: SceneConfig) -> None:
         raise ProblemError(
             f"a scene needs 2 cameras and a point, not {config.cameras} and {config.points}"
         )
-    low, high = 2 * config.points, config.cameras * config.points
+    low = 2 * config.points
+    high = config.cameras * config.points
     if not low <= config.total <= high:
         raise ProblemError(
             f"observations must be {low} to {high} for these cameras and points, not {config.total}"
@@ -171,7 +172,8 @@ def check(config: SceneConfig) -> None:
         )
 
 
-OUTLIER_SHARE, OUTLIER_SIZE = 0.002, 10.0
+OUTLIER_SHARE = 0.002
+OUTLIER_SIZE = 10.0
 """Outliers give BAL's slow convergence: Ceres' rule needs 16 iterations on `ladybug-49` with them,
 11 without."""
 

@@ -102,7 +102,8 @@ def _photos(config: SceneConfig, rng: np.random.Generator) -> Path:
     count = config.cameras
     targets = np.zeros((count, 3))
     targets[:, 0] = np.cumsum(rng.exponential(config.step, count))
-    low, high = np.log(config.min_depth), np.log(config.max_depth)
+    low = np.log(config.min_depth)
+    high = np.log(config.max_depth)
     distance = np.clip((low + high) / 2 + PHOTO_SPREAD * rng.standard_normal(count), low, high)
     focus = config.step * np.exp(distance)
     side = -_directions(rng.uniform(-PHOTO_ANGLE, PHOTO_ANGLE, count))

@@ -35,7 +35,9 @@ class TrueCameras:
     """The true cameras, laid out for fast tests of visibility."""
 
     def __init__(self, config: SceneConfig, path: Path, cameras: Float[np.ndarray, "cameras 9"]):
-        self.config, self.path, self.count = config, path, len(cameras)
+        self.config = config
+        self.path = path
+        self.count = len(cameras)
         self.rotations = rotation_matrices(cameras[:, :3])
         self.translations = cameras[:, 3:6]
         self.rows = np.ascontiguousarray(
@@ -77,7 +79,8 @@ class TrueCameras:
         )
         good = (depth >= unit[0]) & (depth <= unit[1])
         inverse = 1 / np.where(good, depth, 1.0)
-        px, py = across * inverse, upwards * inverse
+        px = across * inverse
+        py = upwards * inverse
         square = px * px + py * py
         focal = self.focal[cameras]
         scale = focal * radial_distortion(square, self.k1[cameras], self.k2[cameras])
@@ -97,8 +100,10 @@ def place_points(
     count = len(lengths)
     reference = rng.permutation(np.arange(count, dtype=np.int32) % scene.count)
     points = np.empty((count, 3))
-    cameras, owners = [], []
-    missing, start = 0, 0
+    cameras = []
+    owners = []
+    missing = 0
+    start = 0
     while start < count:
         part = _next_part(lengths, start, _width(scene, int(lengths[start])))
         points[part], candidates, visible = _place(scene, lengths[part], reference[part], rng)
@@ -137,12 +142,12 @@ def _place(
 
     The best attempt of each point is kept. The second half of the attempts takes other reference
     cameras, since one in a bend of the path may never share a point with enough others."""
-    count, width = len(lengths), _width(scene, int(lengths[0]))
-    points, seen = np.empty((count, 3)), np.zeros(count, dtype=int)
-    candidates, visible = (
-        np.zeros((count, width), dtype=np.int32),
-        np.zeros((count, width), dtype=bool),
-    )
+    count = len(lengths)
+    width = _width(scene, int(lengths[0]))
+    points = np.empty((count, 3))
+    seen = np.zeros(count, dtype=int)
+    candidates = np.zeros((count, width), dtype=np.int32)
+    visible = np.zeros((count, width), dtype=bool)
     todo = np.arange(count)
     for attempt in range(ATTEMPTS):
         first = (
@@ -182,7 +187,8 @@ def _window(
     column = np.arange(width)
     offset = (column + 1) // 2 * np.where(column % 2, 1, -1)
     cameras = reference[:, None] + offset.astype(np.int32)
-    lap, share = scene.path.lap, scene.config.revisit_share
+    lap = scene.path.lap
+    share = scene.config.revisit_share
     if share > 0 and width < lap < scene.count:
         rows = np.flatnonzero(rng.random(len(reference)) < share)
         near = reference[rows]

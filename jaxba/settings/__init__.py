@@ -63,7 +63,8 @@ def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
     such key, or the path continues below a value."""
     *above, last = path.split(".")
     for depth, key in enumerate(above, 1):
-        kind, inside = _type_of(kind, key, path), ".".join(above[:depth])
+        kind = _type_of(kind, key, path)
+        inside = ".".join(above[:depth])
         if not dataclasses.is_dataclass(kind):
             raise SettingsError(f"unknown key {path}; {inside} has no parts")
         inner = data.setdefault(key, {})
@@ -87,7 +88,8 @@ def differences(one: Any, other: Any, path: str = "") -> list[str]:
 
 
 def _value(kind: Any, value: Any, path: str) -> Any:
-    origin, inside = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inside = get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in inside:
             return None

@@ -50,7 +50,9 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
     such configuration or base, no YAML, no mapping, or files that extend each other in a circle."""
     path = find(kind, name)
     data = read_file(path, name)
-    shown, visited, layers = [name], [path.resolve()], [data]
+    shown = [name]
+    visited = [path.resolve()]
+    layers = [data]
     while BASE in data:
         base = data.pop(BASE)
         if not isinstance(base, str):
@@ -79,7 +81,9 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
     mapping has a key twice."""
     import yaml
 
-    where = lambda mark: f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
+    def where(mark):
+        return f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
+
     try:
         loader = (yaml.BaseLoader if as_text else yaml.SafeLoader)(text)
         node = loader.get_single_node()
@@ -96,7 +100,8 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
 def _twice(root: Any) -> Any:
     """A key that a mapping below a node of YAML has twice, so that one of its values would not
     count; or None."""
-    waiting, known = [root], set()
+    waiting = [root]
+    known = set()
     while waiting:
         node = waiting.pop()
         if id(node) in known or not isinstance(getattr(node, "value", ""), list):

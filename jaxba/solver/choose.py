@@ -90,7 +90,8 @@ def choose_linear_solver(
     their own. `observations` are the sorted ones of the problem, if they are known already. Raises
     ProblemError: a method is asked for that does not support the problem; or a factorisation needs
     more memory than the machine has."""
-    lenses, rigs = problem.lenses, problem.rigs
+    lenses = problem.lenses
+    rigs = problem.rigs
     if options.method:
         shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
         check_plain(
@@ -119,7 +120,10 @@ def choose(problem: BundleProblem, observations: ObservationOrder | None = None)
     predicted = predict(problem, observations)
     if problem.residuals and stands_for_rows(problem).all() and np.isfinite(predicted["explicit"]):
         return "explicit"
-    inexact = lambda time: max(INEXACT_ITERATIONS * time, time + LEAST_GAIN)
+
+    def inexact(time):
+        return max(INEXACT_ITERATIONS * time, time + LEAST_GAIN)
+
     times = {
         name: time if name == "explicit" else inexact(time) for name, time in predicted.items()
     }
@@ -151,8 +155,10 @@ def work(
     """Work of one iteration with each linear solver that needs at most `MAX_BYTES`. `products` is
     the number of products of conjugate gradients in a step; `observations` are the sorted ones of
     the problem, if they are known already."""
-    order, width = observations or ObservationOrder.of(problem), _width(problem)
-    counts, observed = count_pairs(order), len(order.order)
+    order = observations or ObservationOrder.of(problem)
+    width = _width(problem)
+    counts = count_pairs(order)
+    observed = len(order.order)
     every = {"step": 1.0, "observation": observed}
     solvers = {"implicit": implicit_work(observed, products)}
     if _bytes_of_blocks(counts, width) <= MAX_BYTES:
@@ -180,14 +186,13 @@ def implicit_work(observed: int, products: float = ASSUMED_PRODUCTS) -> Work:
 def count_pairs(observations: ObservationOrder) -> PairCounts:
     """Counts pairs and blocks. Blocks and bandwidth are upper bounds for more than
     `MAX_COUNTED_PAIRS` pairs."""
-    pairs, cameras, tracks = (
-        observations.num_pairs,
-        observations.num_cameras,
-        observations.moving_tracks,
-    )
+    pairs = observations.num_pairs
+    cameras = observations.num_cameras
+    tracks = observations.moving_tracks
     if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
         return _most_pairs(observations)
-    camera, start = observations.camera[observations.moves], np.cumsum(tracks) - tracks
+    camera = observations.camera[observations.moves]
+    start = np.cumsum(tracks) - tracks
     shared = np.zeros((cameras, cameras), bool)
     for length in np.unique(tracks[tracks > 0]):
         first = start[tracks == length][:, None]
@@ -199,7 +204,8 @@ def count_pairs(observations: ObservationOrder) -> PairCounts:
 
 def _most_pairs(observations: ObservationOrder) -> PairCounts:
     """Upper bounds of blocks and bandwidth."""
-    pairs, cameras = observations.num_pairs, observations.num_cameras
+    pairs = observations.num_pairs
+    cameras = observations.num_cameras
     return PairCounts(pairs, min(pairs, cameras * (cameras + 1) // 2), cameras)
 
 
@@ -209,18 +215,23 @@ def _factoring(
     """Work of forming and factoring the system, and the memory that it needs, bytes. `counts` are
     those of pairs and blocks, `width` is the number of unknowns of a camera. In `rigs` cameras move
     together, so that the system is dense."""
-    unknowns, band = float(width * observations.num_cameras), float(width * counts.bandwidth)
-    points, cameras = observations.num_observed_points, observations.num_cameras
+    unknowns = float(width * observations.num_cameras)
+    band = float(width * counts.bandwidth)
+    points = observations.num_observed_points
+    cameras = observations.num_cameras
     if is_dense(observations, cameras, points + 1):
-        side, inner = unknowns, 3.0 * points
+        side = unknowns
+        inner = 3.0 * points
         if has_small_capacitance(points + 1, cameras):
-            side, inner = 3.0 * (points + 1), unknowns
+            side = 3.0 * (points + 1)
+            inner = unknowns
         return {
             "dense_product": side**2 * inner,
             "square": side**2,
             "cube": side**3,
         }, 3 * 8 * side * inner
-    forming, blocks = {"pair": counts.pairs}, _bytes_of_blocks(counts, width)
+    forming = {"pair": counts.pairs}
+    blocks = _bytes_of_blocks(counts, width)
     if not rigs and is_banded(cameras, counts.bandwidth):
         return forming | {"band": unknowns * band**2}, blocks + 3 * 8 * unknowns * band
     return forming | {
@@ -236,7 +247,8 @@ def _bytes_of_blocks(counts: PairCounts, width: int) -> float:
 
 def _width(problem: BundleProblem) -> int:
     """Unknowns of a camera's block."""
-    lenses, rigs = problem.lenses, problem.rigs
+    lenses = problem.lenses
+    rigs = problem.rigs
     extrinsics = 0 if rigs is None or rigs.free is None else EXTRINSICS_SIZE
     own = (
         CAMERA_SIZE

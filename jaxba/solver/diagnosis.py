@@ -42,9 +42,13 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
         return f"the cost at the start overflows{narrow}"
     first = slots[np.argmin(np.asarray(layout.observation)[slots])]
     number = int(layout.observation[first])
-    camera, point = int(problem.camera_index[number]), int(problem.point_index[number])
+    camera = int(problem.camera_index[number])
+    point = int(problem.point_index[number])
     on_plane = not np.isfinite(inverse_depth[first])
-    name = lambda kind, at: part_name(problem.labels, kind, at)
+
+    def name(kind, at):
+        return part_name(problem.labels, kind, at)
+
     view = name("image", camera)
     why = f"lies on the plane of {view}" if on_plane else f"has a residual in {view} that overflows"
     others = f" (and {slots.size - 1} more)" if slots.size > 1 else ""

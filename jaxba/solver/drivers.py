@@ -73,7 +73,9 @@ class Driver:
     def __init__(
         self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock
     ) -> None:
-        self.setup, self.tolerances, self.clock = setup, tolerances, clock
+        self.setup = setup
+        self.tolerances = tolerances
+        self.clock = clock
         # a conversion by JAX is a program
         self.limit = np.asarray(max(1, max_iterations), np.int32)
         self.length = record_length(max_iterations)

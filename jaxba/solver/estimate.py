@@ -68,7 +68,8 @@ class Estimate(NamedTuple):
 def estimate(observations: int, *, devices: int = 1, in_parts: bool = False) -> Estimate:
     """What so many observations take, divided among devices, each of which computes part by part or
     not."""
-    on_gpu, each = device_memory(), BYTES_IN_PARTS if in_parts else BYTES_PER_OBSERVATION
+    on_gpu = device_memory()
+    each = BYTES_IN_PARTS if in_parts else BYTES_PER_OBSERVATION
     share = devices if np.isfinite(on_gpu) else jax.process_count()
     available = on_gpu if np.isfinite(on_gpu) else process.memory() - BYTES_OF_PROGRAM
     return Estimate(

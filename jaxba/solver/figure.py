@@ -15,7 +15,9 @@ COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#5
 """Okabe and Ito's palette, safe for colour-blind readers; grey for its yellow, which is too light
 for lines."""
 
-COST, DAMPING, REJECTED = COLOURS[1], COLOURS[2], COLOURS[-1]
+COST = COLOURS[1]
+DAMPING = COLOURS[2]
+REJECTED = COLOURS[-1]
 
 
 def plot_history(history: StepInfo, initial_cost: float) -> Picture:

@@ -76,14 +76,17 @@ def system_of(
 ) -> System:
     from scipy.sparse import csr_matrix
 
-    held, points = np.asarray(layout.observation), len(free_points)
+    held = np.asarray(layout.observation)
+    points = len(free_points)
     mask = held < held.max()  # there is always an empty slot
     point = layout.points[np.asarray(layout.slot_point)[mask]]
     order = np.argsort(point, kind="stable")
-    camera, point = np.asarray(layout.slot_camera)[mask][order], point[order]
-    columns = lambda rows: np.moveaxis(
-        np.array([[row[mask] for row in pair] for pair in rows]), 2, 0
-    )[order]
+    camera = np.asarray(layout.slot_camera)[mask][order]
+    point = point[order]
+
+    def columns(rows):
+        return np.moveaxis(np.array([[row[mask] for row in pair] for pair in rows]), 2, 0)[order]
+
     by_camera = columns(linear.camera_jacobian)
     by_point = columns(linear.point_jacobian) * free_points[point][:, None, None]
 
@@ -110,10 +113,8 @@ def system_of(
     at = np.repeat(rows, index.shape[1])
     jacobian = csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))
     place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
-    seen, starts = (
-        np.bincount(point, minlength=points) > 0,
-        np.searchsorted(point, np.arange(points + 1)),
-    )
+    seen = np.bincount(point, minlength=points) > 0
+    starts = np.searchsorted(point, np.arange(points + 1))
     by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (len(rows), 3 * points))
     residual = np.stack(
         [np.asarray(number)[mask][order] for number in linear.residual], axis=1
@@ -150,7 +151,8 @@ def inverse_of(
     )
     weak = values < WEAK
     strong = vectors[:, ~weak]
-    inverse, null = (strong / values[~weak]) @ strong.T, np.zeros((len(whole), 0))
+    inverse = (strong / values[~weak]) @ strong.T
+    null = np.zeros((len(whole), 0))
     if weak.any():
         candidates = vectors[:, weak]
         values, turn = np.linalg.eigh(_squares(system, eliminated, scale[:, None] * candidates))
@@ -169,10 +171,8 @@ def _squares(
     found = change.T @ change
     for first in range(0, len(system.seen), CHUNK):
         last = min(first + CHUNK, len(system.seen))
-        rows, columns = (
-            slice(2 * system.starts[first], 2 * system.starts[last]),
-            slice(3 * first, 3 * last),
-        )
+        rows = slice(2 * system.starts[first], 2 * system.starts[last])
+        columns = slice(3 * first, 3 * last)
         follow = eliminated[columns] @ steps
         change = system.jacobian[rows] @ steps - system.by_point[rows, columns] @ follow
         found += change.T @ change

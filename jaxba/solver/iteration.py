@@ -64,7 +64,10 @@ def problem_info(
 def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
     """The carry before the first iteration."""
     policy_state, damping = policy.init(info)
-    count = lambda n: jnp.asarray(n, jnp.int32)
+
+    def count(n):
+        return jnp.asarray(n, jnp.int32)
+
     return Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
 
 

@@ -86,17 +86,26 @@ def solve_rows(
     if lanes == 1:
         return loops.map_rows(whole, starts, used)
     rows = starts.cameras.shape[0]
-    at = lambda row: jax.tree.map(lambda x: x[row], starts)
-    fresh = lambda row: start(at(row))
+
+    def at(row):
+        return jax.tree.map(lambda x: x[row], starts)
+
+    def fresh(row):
+        return start(at(row))
+
     first = jax.vmap(fresh)(jnp.arange(rows))
-    one = lambda row, carry: iterate(at(row).layout, carry, policy, tolerances, options, limit)
+
+    def one(row, carry):
+        return iterate(at(row).layout, carry, policy, tolerances, options, limit)
 
     def advance(row: Row, carry: Carry) -> tuple[Carry, StepInfo, Bool[Array, ""]]:
         carry, step = one(row, carry)
         return carry, step, carry.termination != Termination.RUNNING
 
     def note(found: Ends, row: Int[Array, " lanes"], carry: Carry, step: StepInfo, _: Any) -> Ends:
-        put = lambda every, own: every.at[row].set(own, mode="drop")
+        def put(every, own):
+            return every.at[row].set(own, mode="drop")
+
         return Ends(
             jax.tree.map(put, found.state, carry.state),
             found.initial_cost,
@@ -143,7 +152,10 @@ def refill(
         found = note(found, jnp.where(row < count, row, rows), lane, record, done)
         new_row = (following + jnp.cumsum(done) - 1).astype(jnp.int32)
         new = jax.vmap(fresh)(jnp.minimum(new_row, count - 1).astype(jnp.int32))
-        pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        def pick(new, old):
+            return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
         row, lane = jax.tree.map(pick, (new_row, new), (row, lane))
         return row, lane, (following + jnp.sum(done)).astype(jnp.int32), found
 

@@ -61,7 +61,10 @@ def loop_from(
 ) -> tuple[Carry, StepInfo]:
     """The loop from a carry to its end; the record has the given length. Other arguments as for
     `solve_loop`."""
-    once = lambda carry: iterate(layout, carry, policy, tolerances, options, limit)
+
+    def once(carry):
+        return iterate(layout, carry, policy, tolerances, options, limit)
+
     shapes = jax.eval_shape(once, carry)[1]
     empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
 

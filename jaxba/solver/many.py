@@ -152,14 +152,18 @@ class _Many:
 
     def __init__(self, policy: DampingPolicy, options: SolveOptions, expected: int) -> None:
         """`expected`: how many problems come."""
-        self._policy, self._options, self._expected = policy, options, expected
+        self._policy = policy
+        self._options = options
+        self._expected = expected
         here = jax.local_devices()
         on_cpu = here[0].platform == "cpu"
         self._devices = here[:1] * process.threads() if on_cpu else here
         self._lanes = 1 if on_cpu else GPU_LANES
         self._bank = BANK * self._lanes
         self._unsorted: list[tuple[_Job, Sizes]] = []
-        self._began, self._seen, self._cells = time.monotonic(), 0, list[Sizes]()
+        self._began = time.monotonic()
+        self._seen = 0
+        self._cells = list[Sizes]()
         self._filling: dict[Sizes, list[_Job]] = {}
         self._programs: dict[Any, _Program] = {}
         self._lock = threading.Lock()
@@ -235,13 +239,12 @@ class _Many:
 
     def _sort(self, *, endless: bool) -> None:
         """Chooses cells for problems that fit none."""
-        unsorted, self._unsorted = self._unsorted, []
+        unsorted = self._unsorted
+        self._unsorted = []
         if not unsorted:
             return
-        every, times = (
-            [sizes for _, sizes in unsorted],
-            max(1.0, endless * self._expected / self._seen),
-        )
+        every = [sizes for _, sizes in unsorted]
+        times = max(1.0, endless * self._expected / self._seen)
         cells = choose_cells(every, times)
         members = Counter(cell_for(sizes, cells) for sizes in every)
         cells = [cell for cell in cells if members[cell] * times >= WORTH]
@@ -353,7 +356,8 @@ class _Program:
 
     def run(self, setups: Sequence[Setup], size: int, options: SolveOptions, lanes: int) -> Ends:
         """The ends of a bank of so many problems, of which there may be fewer."""
-        one, dtype = setups[0], setups[0].dtype
+        one = setups[0]
+        dtype = setups[0].dtype
         rows = [Starts(each.layout, *(x.astype(dtype) for x in each.start)) for each in setups]
         rows += [rows[-1]] * (size - len(rows))
         starts = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)

@@ -253,7 +253,8 @@ def _as_found(kind: Kind) -> str:
     factor = np.sqrt(np.mean(kind.residual**2))
     named = []
     for row in np.argsort(-sizes, kind="stable")[:NAMED].tolist():
-        name, far = kind.row_name(row), kind.off(row, kind.residual[row])
+        name = kind.row_name(row)
+        far = kind.off(row, kind.residual[row])
         named.append(f"{name} is {far}{sizes[row]:.3g} standard deviations off")
     return (
         f"{kind.name}: does not fit its standard deviations, which would have to be {factor:.3g} "

@@ -53,7 +53,9 @@ class Placed(NamedTuple):
         seen = np.flatnonzero(np.asarray(layout.camera_seen)[: problem.num_cameras])
         cameras = np.array(self.here.cameras, np.float64)[: problem.num_cameras]
         cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
-        lenses, rigs, residuals = problem.lenses, problem.rigs, self.counted.residuals
+        lenses = problem.lenses
+        rigs = problem.rigs
+        residuals = self.counted.residuals
         if residuals:
             cameras, own = np.split(cameras, [cameras.shape[1] - sum(residuals.sizes)], axis=1)
             residuals = with_block_values(problem, residuals, own)
@@ -75,10 +77,8 @@ class Placed(NamedTuple):
         order = np.asarray(order)
         real = order < len(points)
         points[order[real]] = np.asarray(state.points, np.float64).T[real]
-        found, constants = (
-            problem.replace(cameras=cameras, points=points, rigs=rigs),
-            problem.constants,
-        )
+        found = problem.replace(cameras=cameras, points=points, rigs=rigs)
+        constants = problem.constants
         if constants is None:
             return (shift(found, self.offset) if far else found).replace(residuals=residuals)
         poses = np.asarray(constants.poses)
@@ -113,6 +113,7 @@ def _with_constants(
     found: BundleProblem, given: BundleProblem, constants: Constants, poses: np.ndarray
 ) -> BundleProblem:
     """A problem with the constant points of another one, and these numbers of its poses."""
-    cameras, points = np.array(found.cameras), np.asarray(constants.points)[:, None]
+    cameras = np.array(found.cameras)
+    points = np.asarray(constants.points)[:, None]
     cameras[:, :POSE_SIZE] = np.where(poses, given.cameras[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
     return found.replace(cameras=cameras, points=np.where(points, given.points, found.points))

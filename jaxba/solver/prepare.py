@@ -37,7 +37,8 @@ from jaxba.typing import AnyArray, ArrayRecord
 
 DEFAULT_POLICY = GUARDED  # name of the default damping policy
 
-PADDED_CAMERAS, PADDED_OBSERVATIONS = 64, 60_000
+PADDED_CAMERAS = 64
+PADDED_OBSERVATIONS = 60_000
 """Largest problem that is padded by default. Measured: iterations take 1.1 to 1.4 times as long up
 to there, but twice with 2,000 observations; with 77 cameras 1.2 to 1.5 times."""
 
@@ -171,7 +172,8 @@ def set_up(
                 refinement=replace(step.refinement, camera_rounds=0, pattern_moves=0),
             )
         observations = ObservationOrder.of(here)
-        asked, given = options.linear_solver, bool(capacity)
+        asked = options.linear_solver
+        given = bool(capacity)
         may_pad = len(devices) == 1 and not step.method and asked in ("auto", "explicit")
         if may_pad and not given and _pads(observations, options):
             capacity = capacity_of(here, observations)

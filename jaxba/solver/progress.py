@@ -64,7 +64,8 @@ class Printed(Waiting):
     @contextmanager
     def iterating(self, iteration: int) -> Iterator[None]:
         """See `Waiting`."""
-        began, last = time.perf_counter(), self._last_s
+        began = time.perf_counter()
+        last = self._last_s
         of_last = f", the last one took {last:.0f}" if last else ""
 
         def show(_: int) -> str:
@@ -84,7 +85,8 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Wa
     that take time."""
     if not verbose:
         return callback, SILENT
-    printed, begun = Printed(), False
+    printed = Printed()
+    begun = False
 
     def show(record: IterationRecord) -> bool | None:
         nonlocal begun
@@ -93,7 +95,8 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Wa
                 f"{COLUMNS}\n{record.iteration - 1:4d}  {record.step.previous_cost:.6e}", flush=True
             )
         print(row(record, printed.time_s), flush=True)
-        begun, printed.time_s = True, record.time_s
+        begun = True
+        printed.time_s = record.time_s
         return callback and callback(record)
 
     return show, printed

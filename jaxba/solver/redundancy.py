@@ -37,7 +37,8 @@ NORMAL = 1.4826  # standard deviation over the median absolute value of normals
 # least standard deviation of pixels, which keeps those of scenes without noise in bounds
 LEAST_PIXELS = 0.01
 
-MOST_UNKNOWNS, MOST_NUMBERS = 3000, 3000
+MOST_UNKNOWNS = 3000
+MOST_NUMBERS = 3000
 """Most unknown numbers of cameras, and numbers of tested rows, whose matrices are dense: ten
 seconds on two cores."""
 
@@ -119,7 +120,8 @@ def left_of(
     chosen = csr_matrix(
         (np.concatenate(factors), (np.concatenate(entries), np.concatenate(columns))), shape
     )
-    by_camera, by_point = chosen @ system.jacobian, chosen @ system.by_point
+    by_camera = chosen @ system.jacobian
+    by_point = chosen @ system.by_point
     blocks = point_blocks(system)
     cross = system.jacobian.T @ system.by_point
     followed = by_point @ blocks
@@ -170,7 +172,8 @@ def _weights(
     problem: BundleProblem, clicked: Bool[np.ndarray, " observations"], loss: Loss, noise: Noise
 ) -> Float[np.ndarray, " observations"]:
     """Square roots of the weights of pixels: the inverse of their deviation, in whitened units."""
-    whitened, pixels = geometry.residuals(problem), problem.observations - geometry.project(problem)
+    whitened = geometry.residuals(problem)
+    pixels = problem.observations - geometry.project(problem)
     with np.errstate(divide="ignore", invalid="ignore"):
         stated = np.linalg.norm(pixels, axis=1) / np.linalg.norm(whitened, axis=1)
     clicks = np.minimum(1.0, np.nan_to_num(stated, nan=1.0) / noise.pixels)

@@ -25,7 +25,8 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.marks import whitening_of
 from jaxba.problem.residuals import Residual, Rows
 
-FIRST, LAST = 2.0, 4.0
+FIRST = 2.0
+LAST = 4.0
 """Scale at the start, and the residual beyond which a match is rejected, in medians of the
 residuals. With normal noise and without wrong matches the latter is 4.7 standard deviations, with
 30% of them 6.3."""
@@ -37,7 +38,8 @@ RowsOfKinds = tuple[tuple[int, int], ...]
 """Rows, each by its kind, of which clicked pixels are the last, and its place there."""
 
 LEAST_SCALE = 3.0  # standard deviations: rows that fit are not further away
-STAGES, STAGE_ITERATIONS = 30, 5
+STAGES = 30
+STAGE_ITERATIONS = 5
 LEAST_WEIGHT = 1e-6  # smallest factor of a residual
 
 

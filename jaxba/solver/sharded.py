@@ -44,7 +44,8 @@ from jaxba.structure.devices import DEVICES, PARTS
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.structure.sum_trees import sorted_by
 
-_DIVIDED, _EVERYWHERE = PartitionSpec(DEVICES), PartitionSpec()
+_DIVIDED = PartitionSpec(DEVICES)
+_EVERYWHERE = PartitionSpec()
 _STATE: Any = _EVERYWHERE, _DIVIDED, _EVERYWHERE
 _REST: Any = (_EVERYWHERE,) * 4
 _CARRY = Carry(LMState(*_STATE), *_REST)
@@ -99,7 +100,8 @@ class Shards:
         all processes. Raises ProblemError: the method of the options works on one device only, or
         there are too few points."""
         check_plain(options, ProblemError, devices=True)
-        self._devices, self._programs = devices, ParallelCompilation()
+        self._devices = devices
+        self._programs = ParallelCompilation()
         self._mesh = Mesh(np.array(devices), (DEVICES,))
         dealt = deal_points(
             problem, parts * len(devices), [rows.points for rows in problem.residuals.rows]
@@ -119,7 +121,10 @@ class Shards:
             _order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)
         ]
         columns = list(zip(*map(jax.tree.leaves, layouts), strict=True))
-        alike = lambda one: self.in_parts and all(np.array_equal(one[0], x) for x in one[1:])
+
+        def alike(one):
+            return self.in_parts and all(np.array_equal(one[0], x) for x in one[1:])
+
         differ = [{k for k, one in enumerate(columns) if not alike(one)}]
         differ = set().union(*distributed.gather(differ))
         apart = tuple(k in differ for k in range(len(columns)))
@@ -335,9 +340,10 @@ def shards_of(
     for k, points in enumerate(dealt):
         number[points] = k
     own = _groups(number[problem.point_index], len(dealt))
-    mask = lambda one: (
-        np.isin(np.arange(problem.num_observations), one) if problem.residuals else one
-    )
+
+    def mask(one):
+        return np.isin(np.arange(problem.num_observations), one) if problem.residuals else one
+
     return [
         problem.subset(mask(one), points=points) for one, points in zip(own, dealt, strict=True)
     ]
@@ -356,7 +362,10 @@ def sharded_layout(
         for number in range(MAX_ROUNDS):
             common = {} if number < 2 else common  # the first round knows no totals
             agreements = [Agreement(known, common) for _ in shards]
-            build = lambda shard, one: build_layout(shard, options, agreement=one)
+
+            def build(shard, one):
+                return build_layout(shard, options, agreement=one)
+
             layouts = list(threads.map(build, shards, agreements))
             found = merged(merge([merged([one.found for one in agreements], {})]), known)
             if same(found, known):

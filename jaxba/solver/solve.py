@@ -294,7 +294,8 @@ def solve_without(
     saved = checkpoint and checkpoint.load()
     problem, away = (saved.problem, saved.away) if saved else (problem, away)
     setup = set_up(problem, policy, options, away, in_parts=True, tell=waiting.tell)
-    steps, records = None, saved.steps if saved else []
+    steps = None
+    records = saved.steps if saved else []
     end = (
         Termination.RUNNING if len(records) < options.max_iterations else Termination.MAX_ITERATIONS
     )
@@ -309,18 +310,19 @@ def solve_without(
         with waiting.compiling():
             state = driver.begin()
         setup.check_cost(state)
-        initial_cost, compiled, watched, began = (
-            float(state.cost),
-            driver.compile_s(),
-            0.0,
-            time.perf_counter(),
-        )
+        initial_cost = float(state.cost)
+        compiled = driver.compile_s()
+        watched = 0.0
+        began = time.perf_counter()
         initial_cost, before_s = (
             (saved.initial_cost, saved.total_s) if saved else (initial_cost, 0.0)
         )
-        elapsed = lambda: (
-            before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
-        )
+
+        def elapsed():
+            return (
+                before_s + time.perf_counter() - began - watched - (driver.compile_s() - compiled)
+            )
+
         if saved and end == Termination.RUNNING:
             driver.carry = saved.continued(driver.carry)
             waiting.resume(len(records), before_s)
@@ -357,7 +359,8 @@ def solve_without(
                 )
                 checkpoint.save(Saved(*now, carry=driver.carry))
             watched += time.perf_counter() - looked
-        total_s, compile_s = elapsed(), driver.compile_s()
+        total_s = elapsed()
+        compile_s = driver.compile_s()
         driver.end()
         if compile_s > 0:
             process.release_programs()  # see above: too many programs end a process
@@ -375,7 +378,10 @@ def _continued(options: SolveOptions, problem: BundleProblem, iterations: int) -
     """A problem after some more iterations, from Python, so that all limits use the same
     programs."""
     options = replace(options, max_iterations=iterations)
-    go_on = lambda record: False
+
+    def go_on(record):
+        return False
+
     away = np.zeros(0, int)  # views of images that face away are left out already
     return solve_without(away, problem, AGAIN, options, callback=go_on, watch=None).problem
 
@@ -390,7 +396,9 @@ def solution_of(
 ) -> Solution:
     """The solution of a solve that ended in a state, without the time of compilation;
     `initial_cost` in pixels^2, `total_s` in seconds."""
-    count, final_cost, counted = len(steps.cost), float(state.cost), setup.placed.counted
+    count = len(steps.cost)
+    final_cost = float(state.cost)
+    counted = setup.placed.counted
     gave_up = end in (Termination.DAMPING_LIMIT, Termination.STALLED)
     if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
         end = Termination.ROUNDING

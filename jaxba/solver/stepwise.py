@@ -62,12 +62,15 @@ class Stepwise(Driver):
         """`first` are the iterations before the step is fully optimised (`iterations_before`);
         other arguments as for `Driver`."""
         super().__init__(*arguments)
-        self._first, self._done = first, 0
+        self._first = first
+        self._done = 0
         # whether the fully optimised program of a part is on disk
         self._stored: dict[str, bool] = {}
         self._wanted: list[Wanted] = []  # those of which the quick ones were run
-        self._ran_quick, self._quick_s = False, 0.0
-        self._programs, self._compile_s = ParallelCompilation(), 0.0
+        self._ran_quick = False
+        self._quick_s = 0.0
+        self._programs = ParallelCompilation()
+        self._compile_s = 0.0
 
     def compile_s(self) -> float:
         """See `Driver`."""
@@ -75,7 +78,8 @@ class Stepwise(Driver):
 
     def begin(self) -> LMState:
         """The state at the start."""
-        began, setup = time.perf_counter(), self.setup
+        began = time.perf_counter()
+        setup = self.setup
         with self._programs as compile_programs:
             self._iterate(
                 compile_programs, self._begin(compile_programs, setup.initial(compile_programs))
@@ -123,7 +127,8 @@ class Stepwise(Driver):
     def _part(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, ...]:
         """The program of a part of the step at its level, and its arguments. A fully optimised one
         that is on disk is taken; one that is not is noted."""
-        name, level = function.__name__, "quick" if self._done < self._first else "full"
+        name = function.__name__
+        level = "quick" if self._done < self._first else "full"
         if level == "quick" and self._first < NEVER:
             if name not in self._stored:
                 path = self._programs.path(program(function, "options"), *arguments)
@@ -145,12 +150,10 @@ class Stepwise(Driver):
 
     def _iterate(self, call: Call, carry: Carry) -> tuple[Carry, StepInfo, Any]:
         """One iteration: the next carry, its record, and the packed report for the host."""
-        state, layout, options, policy = (
-            carry.state,
-            self.setup.layout,
-            self.setup.options,
-            self.setup.policy,
-        )
+        state = carry.state
+        layout = self.setup.layout
+        options = self.setup.options
+        policy = self.setup.policy
 
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(policy.min_gain, state.cost.dtype)

@@ -44,11 +44,15 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
     arbitrarily at the end. `shared` are symmetric edge weights without a diagonal, [nodes, nodes],
     and `clusters` is the largest number of groups. Returns the label of each node, numbered from
     0."""
-    label, size, weight = np.arange(nodes), np.ones(nodes), shared
+    label = np.arange(nodes)
+    size = np.ones(nodes)
+    weight = shared
     while (groups := len(size)) > clusters:
-        degree, column = np.diff(weight.indptr), weight.indices
+        degree = np.diff(weight.indptr)
+        column = weight.indices
         row = np.repeat(np.arange(groups), degree)
-        best, strength = np.full(groups, -1), np.zeros(groups)
+        best = np.full(groups, -1)
+        strength = np.zeros(groups)
         if len(row):
             affinity = weight.data / (size[row] * size[column])
             begin = weight.indptr[:-1][degree > 0]
@@ -65,12 +69,14 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
         into = np.arange(groups)
         into[best[pair]] = pair
         kept, new = np.unique(into, return_inverse=True)
-        row, column = new[row], new[column]
+        row = new[row]
+        column = new[column]
         between = row != column
         weight = csr_matrix(
             (weight.data[between], (row[between], column[between])), shape=(len(kept), len(kept))
         )
-        size, label = np.bincount(new, size), new[label]
+        size = np.bincount(new, size)
+        label = new[label]
     return np.unique(label, return_inverse=True)[1]
 
 

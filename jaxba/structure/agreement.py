@@ -18,7 +18,9 @@ class Agreement:
     def __init__(self, known: dict[str, Any] | None, common: dict[str, Any]) -> None:
         """`known` was found in the round before, `common` is what the shards of this round have in
         common so far."""
-        self._known, self._common, self._prefix = known, common, ""
+        self._known = known
+        self._common = common
+        self._prefix = ""
         self.found: dict[str, Any] = {}
 
     def within(self, name: str) -> Agreement:
@@ -87,5 +89,8 @@ def _kind(key: str) -> str:
 
 def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether two rounds found the same."""
-    equal = lambda a, b: (a != b).nnz == 0 if hasattr(a, "nnz") else np.array_equal(a, b)
+
+    def equal(a, b):
+        return (a != b).nnz == 0 if hasattr(a, "nnz") else np.array_equal(a, b)
+
     return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)

@@ -60,8 +60,11 @@ def cluster_layout(
     `most_clusters`. The other shards of a problem (`agreement`) have the same clusters."""
     from jaxba.structure.agglomeration import shared_points  # SciPy: its import takes 0.2 s
 
-    camera, point, points = observations.camera, observations.point, len(observations.tracks)
-    frame, frames = np.asarray(unknowns.poses.index), unknowns.poses.distinct
+    camera = observations.camera
+    point = observations.point
+    points = len(observations.tracks)
+    frame = np.asarray(unknowns.poses.index)
+    frames = unknowns.poses.distinct
     shared = agreement.total(
         "shared points", lambda: shared_points(frame[camera], point, frames, points)[0]
     )
@@ -76,7 +79,8 @@ def cluster_layout(
     first = np.flatnonzero(np.diff(keys, prepend=-1))
     keys, counts = keys[first], np.diff(first, append=len(keys))
     seen_by = np.bincount(keys // clusters, minlength=points)
-    coarse, count = np.arange(len(keys)), agreement.size("coarse", len(keys))
+    coarse = np.arange(len(keys))
+    count = agreement.size("coarse", len(keys))
     width = agreement.size("width", fitting_width(counts))
     counts = np.append(counts, np.zeros(count + 1 - len(keys), counts.dtype))
     first_slots = np.append(slots.slot[order][first], np.full(count + 1 - len(keys), slots.empty))
@@ -107,7 +111,8 @@ def _labels(
     """The cluster of each camera, and which clusters have unknowns in common."""
     from jaxba.structure.agglomeration import agglomerate, joined
 
-    lenses, num_clusters = unknowns.lenses, max(1, min(most, cameras // CLUSTER_CAMERAS))
+    lenses = unknowns.lenses
+    num_clusters = max(1, min(most, cameras // CLUSTER_CAMERAS))
     label = agglomerate(shared, unknowns.poses.distinct, num_clusters)[
         np.asarray(unknowns.poses.index)
     ]

@@ -58,7 +58,9 @@ def reverse_cuthill_mckee(linked: Bool[np.ndarray, "nodes nodes"]) -> Int[np.nda
     increasing degree; reversed. The same order as SciPy's, whose import takes longer than this for
     a thousand cameras."""
     degree = (linked.sum(axis=1) + linked.diagonal()).astype(np.int32)
-    order, found, waiting = np.empty(len(linked), np.int64), 0, np.ones(len(linked), bool)
+    order = np.empty(len(linked), np.int64)
+    found = 0
+    waiting = np.ones(len(linked), bool)
     for seed in np.argsort(degree):
         if not waiting[seed]:
             continue
@@ -67,7 +69,8 @@ def reverse_cuthill_mckee(linked: Bool[np.ndarray, "nodes nodes"]) -> Int[np.nda
             new = np.flatnonzero(linked[order[done]] & waiting)
             order[found : found + len(new)] = new[np.argsort(degree[new], kind="stable")]
             waiting[new] = False
-            done, found = done + 1, found + len(new)
+            done = done + 1
+            found = found + len(new)
     return order[::-1]
 
 

@@ -20,7 +20,9 @@ from jaxba.structure.padding import MAX_CAMERAS, MAX_OBSERVATIONS, MAX_PAIRS, Ca
 # sizes of cells are multiples of these, so that later problems fit
 ROUNDED = np.array([1, 16, 64, 256])
 
-FIXED_S, CUBE_S, EACH_S = 5e-5, 2.5e-11, np.array([1e-5, 7e-7, 2.7e-7, 6e-9])
+FIXED_S = 5e-5
+CUBE_S = 2.5e-11
+EACH_S = np.array([1e-5, 7e-7, 2.7e-7, 6e-9])
 """Seconds of an iteration on one core: of any, for a cube of unknowns, and for each of `Sizes` that
 is padding, on windows of 5 to 20 cameras, x86-64 with AVX-512. The work for the pairs that there
 are is the same in every cell."""
@@ -43,8 +45,10 @@ class Sizes(NamedTuple):
     def of(cls, problem: BundleProblem) -> Sizes:
         """Those of a problem as it is laid out."""
         observations = ObservationOrder.of(problem)
-        cameras, tracks = observations.num_cameras, observations.tracks
-        pairs, slots = observations.num_listed_pairs, slots_for(tracks)
+        cameras = observations.num_cameras
+        tracks = observations.tracks
+        pairs = observations.num_listed_pairs
+        slots = slots_for(tracks)
         general = problem.lenses or problem.rigs or problem.residuals
         return cls(cameras, len(tracks), slots, pairs, cameras if general else 0)
 
@@ -82,15 +86,19 @@ def _cells_of_kind(seen: Sequence[Sizes], times: float) -> list[Sizes]:
     rows = -(-np.array([one[:4] for one in seen]) // ROUNDED) * ROUNDED
     rows, counts = np.unique(rows, axis=0, return_counts=True)
     order = np.argsort(work(rows), kind="stable")
-    rows, counts = rows[order], counts[order] * times * ITERATIONS
-    number, before = len(rows), np.concatenate([[0], np.cumsum(counts)])
+    rows = rows[order]
+    counts = counts[order] * times * ITERATIONS
+    number = len(rows)
+    before = np.concatenate([[0], np.cumsum(counts)])
     # of one cell, by the first of its rows and the one after them
     price = np.full((number + 1, number + 1), np.inf)
     for first in range(number):
         price[first, first + 1 :] = work(np.maximum.accumulate(rows[first:])) * (
             before[first + 1 :] - before[first]
         )
-    best, cuts, saved = price[0], [], np.inf
+    best = price[0]
+    cuts = []
+    saved = np.inf
     while True:
         with_one_more = best[:, None] + price
         saved = best[-1] - with_one_more[:, -1].min()

@@ -87,9 +87,11 @@ def pair_layout(
     band, where that is cheaper. With a `capacity` all shapes follow from that: every block of the
     lower triangle is listed, and no band is used. The other shards of a problem (`agreement`) have
     the same blocks."""
-    camera, row_index = camera.astype(np.int32), row_index.astype(np.int32)
+    camera = camera.astype(np.int32)
+    row_index = row_index.astype(np.int32)
     left, right = _pairs_of_tracks(tracks)
-    rows, columns = camera[left], camera[right]
+    rows = camera[left]
+    columns = camera[right]
     # if a camera sees a point twice, both orders of the pair add to the same diagonal block
     twice = np.flatnonzero(rows == columns)
     twice = twice[left[twice] != right[twice]]
@@ -102,7 +104,8 @@ def pair_layout(
     others = np.divmod(
         agreement.others("blocks", lambda: rows.astype(np.int64) * cameras + columns), cameras
     )
-    rank, reach = np.arange(cameras), cameras
+    rank = np.arange(cameras)
+    reach = cameras
     if factor and banded and capacity is None:
         rank, reach = _band_order((rows, columns), others, cameras)
     banded = is_banded(cameras, reach)
@@ -110,7 +113,8 @@ def pair_layout(
     # ranks
     if banded:
         ranks = rank.astype(np.int32)
-        rows, columns = ranks[rows], ranks[columns]
+        rows = ranks[rows]
+        columns = ranks[columns]
         swap = rows < columns
         left, right = np.where(swap, right, left), np.where(swap, left, right)
         rows, columns = np.maximum(rows, columns), np.minimum(rows, columns)
@@ -125,9 +129,9 @@ def pair_layout(
     # smaller ones, of which the last is rarely full
     largest = PAIR_BATCH if capacity is None else -(-PAIR_BATCH // 2)
 
-    number_of = lambda width: agreement.size(
-        f"chunks of {width}", room.chunks(room.items, counts, width)
-    )
+    def number_of(width):
+        return agreement.size(f"chunks of {width}", room.chunks(room.items, counts, width))
+
     width = min(PAIR_CHUNKS, key=lambda w: number_of(w) * (w + PAIR_ITEM_COST))
     width = max(1, min(width, agreement.size("pairs", room.most)))
     chunks = -(-counts // width)
@@ -216,8 +220,11 @@ def _pairs_of_tracks(
     lengths = np.bincount(tracks, minlength=1)
     start = np.cumsum(tracks) - tracks
     total = int(lengths @ (np.arange(len(lengths)) * np.arange(1, len(lengths) + 1) // 2))
-    left, right = np.empty(total, np.int32), np.empty(total, np.int32)
-    first, point, pair = start[sorted_by(tracks, len(lengths))].astype(np.int32), int(lengths[0]), 0
+    left = np.empty(total, np.int32)
+    right = np.empty(total, np.int32)
+    first = start[sorted_by(tracks, len(lengths))].astype(np.int32)
+    point = int(lengths[0])
+    pair = 0
     for length in np.flatnonzero(lengths[1:]) + 1:
         count = np.arange(1, length + 1, dtype=np.int32)
         later = np.repeat(count - 1, count)
@@ -225,10 +232,12 @@ def _pairs_of_tracks(
             np.cumsum(count, dtype=np.int32) - count, count
         )
         own = first[point : point + lengths[length], None]
-        shape, end = (len(own), len(later)), pair + len(own) * len(later)
+        shape = (len(own), len(later))
+        end = pair + len(own) * len(later)
         np.add(own, later, out=left[pair:end].reshape(shape))
         np.add(own, earlier, out=right[pair:end].reshape(shape))
-        point, pair = point + len(own), end
+        point = point + len(own)
+        pair = end
     return left, right
 
 
@@ -256,7 +265,8 @@ def _batch_sums(
     within = _since(is_start)
     starts_sum = within % TREE_WIDTH == 0
     # batch and block of each partial sum
-    sum_batch, target = own_batch[starts_sum], block[starts_sum]
+    sum_batch = own_batch[starts_sum]
+    target = block[starts_sum]
     counts = np.bincount(sum_batch, minlength=batches)
     partial = agreement.size("partial", int(counts.max()))
     # nearly always a batch has sums of few blocks; at worst it has as many sums as chunks
@@ -267,7 +277,8 @@ def _batch_sums(
     number = _since(np.diff(sum_batch, prepend=-1) != 0)
     sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
     sums[own_batch, number[np.cumsum(starts_sum) - 1], within % TREE_WIDTH] = position
-    items, empty = sum_batch * (partial + 1) + number, batches * (partial + 1) - 1
+    items = sum_batch * (partial + 1) + number
+    empty = batches * (partial + 1) - 1
     counts = np.bincount(target, minlength=len(chunks) + 1)
     if most is None:
         levels = sum_tree(items, counts, empty, TREE_WIDTH, agreement=agreement.within("sums"))

@@ -32,7 +32,8 @@ def has_small_capacitance(columns: int, cameras: int) -> bool:
 def is_dense(observations: ObservationOrder, cameras: int, columns: int) -> bool:
     """Whether one dense product is cheaper than listed pairs. Impossible if a camera sees a point
     twice. The numbers of cameras and of columns, points in layout order, include padding."""
-    pairs, points = observations.num_pairs, observations.num_observed_points
+    pairs = observations.num_pairs
+    points = observations.num_observed_points
     dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > MIN_DENSITY * points * cameras**2
     return (
         dense or has_small_capacitance(columns, cameras)

@@ -148,14 +148,17 @@ def build_layout(
         grid: whether a factored system may be formed as one dense matrix product instead of from
             pairs, where that is cheaper (structure/density.py).
         agreement: with the layouts of the other shards of a problem (solver/sharded.py)."""
-    factor, pairs = options.factors_reduced_system, options.forms_reduced_system
+    factor = options.factors_reduced_system
+    pairs = options.forms_reduced_system
     if capacity is not None and not factor:
         raise ValueError("only layouts for a factored system are padded")
     observations = observations or ObservationOrder.of(problem)
     if capacity is not None and not capacity.holds(observations):
         raise ValueError(f"the problem is larger than the capacity: {capacity}")
     cameras = observations.num_cameras if capacity is None else capacity.cameras
-    camera, tracks, order = observations.camera, observations.tracks, observations.order
+    camera = observations.camera
+    tracks = observations.tracks
+    order = observations.order
     seen = np.bincount(camera, minlength=cameras)
     is_seen = agreement.total("seen", lambda: seen) > 0
 
@@ -164,7 +167,9 @@ def build_layout(
         if capacity is None
         else padded_slots(tracks, capacity)
     )
-    slot, empty, count = slots.slot, slots.empty, len(slots.point)
+    slot = slots.slot
+    empty = slots.empty
+    count = len(slots.point)
 
     def in_slots(values: np.ndarray, otherwise: Any = 0) -> np.ndarray:
         """Values of the sorted observations, which are their first axis, as the last axis of the
@@ -173,7 +178,9 @@ def build_layout(
         found[..., slot] = np.moveaxis(values, 0, -1)
         return found
 
-    in_order = lambda values: in_slots(np.asarray(values, np.float64)[order])
+    def in_order(values):
+        return in_slots(np.asarray(values, np.float64)[order])
+
     room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
     by_camera = sorted_by(camera, cameras)
     levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, agreement.within("cameras"))

@@ -65,10 +65,13 @@ def cluster(
     """One clustering: the cluster of every camera, numbered from 0. Arguments as for `clusterings`;
     the cut edges of the previous clustering are contracted first (None: no such preference), and
     without `rng` choices are greedy."""
-    nodes, edges = len(graph.indptr) - 1, graph.nnz / 2
+    nodes = len(graph.indptr) - 1
+    edges = graph.nnz / 2
     degree = np.asarray(graph.sum(axis=1)).ravel()
     total = max(float(degree.sum()), np.finfo(float).tiny)
-    label, weight, size = np.arange(nodes), graph, np.ones(nodes, int)
+    label = np.arange(nodes)
+    weight = graph
+    size = np.ones(nodes, int)
     if previous is not None and largest > 1:
         label, weight, degree, size = _collapse(
             _matching(graph, previous), label, weight, degree, size
@@ -114,11 +117,13 @@ def _pass(
     Nodes choose by the gain in modularity: the weight of the edge minus its expectation from the
     degrees."""
     nodes = len(size)
-    row, column = np.repeat(np.arange(nodes), np.diff(weight.indptr)), weight.indices
+    row = np.repeat(np.arange(nodes), np.diff(weight.indptr))
+    column = weight.indices
     gain = sharpness * (weight.data - degree[column] * degree[row] / total)
     stay = np.zeros(nodes)
     if rng is not None:  # Gumbel-max trick: the argmax is a sample of the softmax
-        gain, stay = gain + rng.gumbel(size=len(gain)), rng.gumbel(size=nodes)
+        gain = gain + rng.gumbel(size=len(gain))
+        stay = rng.gumbel(size=nodes)
     gain[size[row] + size[column] > largest] = -np.inf
     choosing = np.flatnonzero(np.diff(weight.indptr) > 0)
     if not len(choosing):
@@ -127,7 +132,9 @@ def _pass(
     is_best = np.flatnonzero(gain == np.repeat(best, np.diff(weight.indptr)[choosing]))
     first = is_best[np.unique(row[is_best], return_index=True)[1]]
     moving = best > stay[choosing]
-    into, members, joined = list(range(nodes)), size.tolist(), [False] * nodes
+    into = list(range(nodes))
+    members = size.tolist()
+    joined = [False] * nodes
     sizes = size.tolist()
     for node, target in zip(choosing[moving].tolist(), column[first][moving].tolist(), strict=True):
         # a node that others have joined stays, and a node that has left its community cannot be
@@ -150,5 +157,8 @@ def _collapse(
     edges = (merge.T @ weight @ merge).tocoo()
     cut = edges.row != edges.col
     weight = csr_matrix((edges.data[cut], (edges.row[cut], edges.col[cut])), shape=edges.shape)
-    count = lambda x: np.bincount(new, weights=x, minlength=len(kept))
+
+    def count(x):
+        return np.bincount(new, weights=x, minlength=len(kept))
+
     return new[label], weight, count(degree), count(size).astype(int)

@@ -31,8 +31,10 @@ class ObservationOrder:
     def of(cls, problem: BundleProblem) -> ObservationOrder:
         """Sorts the observations of a problem in linear time; ties keep the order of the
         problem."""
-        camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
-        cameras, points = len(problem.cameras), len(problem.points)
+        camera = np.asarray(problem.camera_index)
+        point = np.asarray(problem.point_index)
+        cameras = len(problem.cameras)
+        points = len(problem.points)
         order = sorted_by(camera, cameras)
         order = order[sorted_by(point[order], points)]
         tracks = np.bincount(point, minlength=points)
@@ -61,7 +63,8 @@ class ObservationOrder:
     @cached_property
     def num_repeated_pairs(self) -> int:
         """Number of these pairs that are different observations of one point by one camera."""
-        point, camera = self.point[self.moves], self.camera[self.moves]
+        point = self.point[self.moves]
+        camera = self.camera[self.moves]
         new = np.ones(len(point), bool)
         new[1:] = (np.diff(point) != 0) | (np.diff(camera) != 0)
         times = np.diff(np.append(np.flatnonzero(new), len(new)))

@@ -88,7 +88,8 @@ def capacity_of(
     or other residuals than those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS` or than the
     last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
     observations = observations or ObservationOrder.of(problem)
-    cameras, points = observations.num_cameras, len(observations.tracks)
+    cameras = observations.num_cameras
+    points = len(observations.tracks)
     if problem.rigs or problem.residuals or cameras > MAX_CAMERAS:
         return None
     needed = slots_for(observations.tracks)
@@ -136,9 +137,10 @@ def padded_parameters(
     problem: BundleProblem, capacity: Capacity
 ) -> tuple[Float[np.ndarray, "cameras parameters"], Float[np.ndarray, "points 3"]]:
     """The problem's cameras and points, padded with zeros to the capacity."""
-    padded = lambda rows, count: np.pad(
-        np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0))
-    )
+
+    def padded(rows, count):
+        return np.pad(np.asarray(rows, np.float64), ((0, count - len(rows)), (0, 0)))
+
     return padded(problem.cameras, capacity.cameras), padded(problem.points, capacity.points)
 
 

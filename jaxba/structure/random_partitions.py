@@ -58,7 +58,9 @@ def partition_layout(
     cameras fit in one cluster. The pairs are not banded."""
     from jaxba.structure.louvain import camera_graph, clusterings  # SciPy: its import takes 0.2 s
 
-    camera, point, cameras = observations.camera, observations.point, observations.num_cameras
+    camera = observations.camera
+    point = observations.point
+    cameras = observations.num_cameras
     labels = np.zeros((1, cameras), int)
     if cameras > largest:
         graph = camera_graph(camera, point, cameras, len(observations.tracks))
@@ -73,7 +75,8 @@ def partition_layout(
     most = max(len(counts) for _, counts in replicas) + 1
     # for trees of equal shapes
     room = Room(len(camera), max(int(counts.max()) for _, counts in replicas))
-    trees, slot_replica = [], np.full((len(labels), len(slots.point)), most - 1, np.int32)
+    trees = []
+    slot_replica = np.full((len(labels), len(slots.point)), most - 1, np.int32)
     for number, (which, counts) in enumerate(replicas):
         items = slots.slot[np.argsort(which, kind="stable")]
         trees.append(
@@ -94,7 +97,8 @@ def partition_layout(
 def _blocks(members: np.ndarray, label: np.ndarray, pairs: PairLayout) -> np.ndarray:
     """The array `Partition.blocks` of one clustering."""
     clusters, size = members.shape
-    row, column = np.asarray(pairs.block_row)[:-1], np.asarray(pairs.block_column)[:-1]
+    row = np.asarray(pairs.block_row)[:-1]
+    column = np.asarray(pairs.block_column)[:-1]
     zero = len(row)
     position = np.zeros(len(label), int)
     cluster, rank = np.nonzero(members < len(label))

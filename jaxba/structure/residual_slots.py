@@ -57,17 +57,18 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
     residuals = problem.residuals
     if not residuals:
         return problem
-    camera, point = [np.asarray(problem.camera_index)], [np.asarray(problem.point_index)]
-    observations, points, cameras = (
-        problem.num_observations,
-        problem.num_points,
-        problem.num_cameras,
-    )
-    found, groups = [], block_groups(problem)
+    camera = [np.asarray(problem.camera_index)]
+    point = [np.asarray(problem.point_index)]
+    observations = problem.num_observations
+    points = problem.num_points
+    cameras = problem.num_cameras
+    found = []
+    groups = block_groups(problem)
     sees = np.zeros(problem.num_points + 1, int)  # the last for no point
     sees[point[0]] = camera[0]
     for rows in residuals.rows:
-        owners, pairs = owners_of(problem, rows, groups), -(-rows.size // 2)
+        owners = owners_of(problem, rows, groups)
+        pairs = -(-rows.size // 2)
         shape = (len(rows), pairs, max(len(owners.cameras), len(owners.points)))
         own = [np.where(c < 0, sees[p], c) for c, p in itertools.product(*owners)]
         at = [np.where(p < 0, points + np.arange(len(rows)), p) for p in owners.points]
@@ -85,15 +86,21 @@ def laid_out(problem: BundleProblem) -> BundleProblem:
         size = len(camera[-1])
         found.append(replace(rows, observation=observations + np.arange(size).reshape(shape)))
         observations += size
-    more, extra = observations - problem.num_observations, points - problem.num_points
-    rest = lambda x, count: np.concatenate(
-        [np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)]
-    )
+    more = observations - problem.num_observations
+    extra = points - problem.num_points
+
+    def rest(x, count):
+        return np.concatenate(
+            [np.asarray(x), np.zeros((count, *np.shape(x)[1:]), np.asarray(x).dtype)]
+        )
+
     new = np.arange(cameras - problem.num_cameras)
     groups = [np.append(own, -cameras + new) for own in groups]
     # new ones have the lens of the first
     every = np.append(np.arange(problem.num_cameras), 0 * new)
-    held, rigs, pairs = problem.constants, problem.rigs, zip(residuals.blocks, groups, strict=True)
+    held = problem.constants
+    rigs = problem.rigs
+    pairs = zip(residuals.blocks, groups, strict=True)
     blocks = (
         np.where((own >= 0)[:, None], np.asarray(x)[np.maximum(own, 0)], 0.0) for x, own in pairs
     )
@@ -130,9 +137,11 @@ def with_block_values(
     problem: BundleProblem, residuals: Residuals, values: Float[np.ndarray, "cameras numbers"]
 ) -> Residuals:
     """Residuals with the values of their blocks after a solve, from the numbers of cameras."""
-    blocks, start = [], 0
+    blocks = []
+    start = 0
     for block, group in zip(residuals.blocks, block_groups(problem), strict=True):
-        after, known = np.array(block), group >= 0
+        after = np.array(block)
+        known = group >= 0
         after[group[known]] = values[known, start : start + block.shape[1]]
         blocks.append(after)
         start += block.shape[1]

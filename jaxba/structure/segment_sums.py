@@ -106,7 +106,10 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     padded."""
     for level in levels:
         if rows.ndim > 2:
-            level_sum = lambda rows, level: jnp.sum(take_rows(rows, level), axis=1)
+
+            def level_sum(rows, level):
+                return jnp.sum(take_rows(rows, level), axis=1)
+
             rows = compute_unfused(level_sum, rows, jnp.asarray(level), index=level)
             continue
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
@@ -166,7 +169,8 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
             operator.add, [seen[:, k * count : (k + 1) * count] for k in range(POINT_CHUNK)]
         )
         return _sum_of_chunks(layout, layout.point_levels, chunks)
-    parts, start = [], 0
+    parts = []
+    start = 0
     for bucket in layout.buckets:
         end = start + math.prod(bucket)
         parts.append(
@@ -182,7 +186,8 @@ def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float
         return list(point_sum(layout, jnp.stack(rows)))
     if layout.point_levels is not None:
         return point_sums_of(layout, lambda rows: rows, rows)
-    parts, start = [], 0
+    parts = []
+    start = 0
     for bucket in layout.buckets:
         end = start + math.prod(bucket)
         parts.append(

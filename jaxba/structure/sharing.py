@@ -90,7 +90,8 @@ class Sharing(ArrayRecord):
     def joined(*parts: tuple[Sharing, int]) -> Sharing:
         """That of numbers of items, flattened: for each item those of the first part, then those of
         the next."""
-        columns, end = [], 0
+        columns = []
+        end = 0
         for part, size in parts:
             columns.append(end + jnp.asarray(part.index)[:, None] * size + jnp.arange(size))
             end += part.distinct * size

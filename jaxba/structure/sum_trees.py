@@ -71,7 +71,8 @@ def sum_tree(
     most = agreement.size("most", most)
     while True:
         width = max(1, min(width, most))
-        chunks, last = -(-counts // width), most <= width
+        chunks = -(-counts // width)
+        last = most <= width
         space = room.chunks(space, counts, width)
         space = agreement.size(f"level {len(levels)}", space)
         rows = np.arange(len(counts)) if last else np.cumsum(chunks) - chunks
@@ -83,8 +84,11 @@ def sum_tree(
         levels.append(level)
         if last:
             return tuple(levels)
-        items, counts, empty = np.arange(int(chunks.sum())), chunks, total - 1
-        most, width = -(-most // width), TREE_WIDTH
+        items = np.arange(int(chunks.sum()))
+        counts = chunks
+        empty = total - 1
+        most = -(-most // width)
+        width = TREE_WIDTH
 
 
 # most targets that have an item of a rank, relative to all items; the last suffices always
@@ -128,7 +132,8 @@ def prefix_levels(
     ranks = [first]
     while ranks[-1] < room.most:
         ranks.append(max(1, 2 * ranks[-1]))
-    begins, ends = ranks[:-1], ranks[1:]
+    begins = ranks[:-1]
+    ends = ranks[1:]
     present = [np.count_nonzero(counts > rank) for rank in begins]
     for share in PREFIX_SHARES[-1:] if loosest else PREFIX_SHARES[tightest:]:
         lengths = [

@@ -59,7 +59,10 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALON
     lengths = _bucket_lengths(values, counts)
     which = np.searchsorted(lengths, tracks)
     column = np.zeros(len(tracks), np.int64)  # index of a point in its bucket
-    bucket_points, slot_point, offsets, buckets = [], [], [], []
+    bucket_points = []
+    slot_point = []
+    offsets = []
+    buckets = []
     slots = columns = 0
     for number, length in enumerate(lengths):
         members = np.flatnonzero((which == number) & (tracks > 0))
@@ -158,7 +161,8 @@ def _bucket_lengths(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
         if not len(enough):
             penalties *= PENALTY_FACTOR**PENALTIES
             continue
-        ends, end = [], len(values)
+        ends = []
+        end = len(values)
         while end:
             ends.append(end - 1)
             end = cut[enough[0], end]

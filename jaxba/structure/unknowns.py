@@ -108,7 +108,8 @@ class Unknowns(ArrayRecord):
     def _each(self, name: str, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         if not self.shared:
             return x
-        found, start = [], 0
+        found = []
+        start = 0
         for sharing, size in self.parts:
             found.append(getattr(sharing, name)(x[:, start : start + size]))
             start += size
@@ -149,10 +150,8 @@ class Unknowns(ArrayRecord):
         """A step of camera blocks, with zeros for the numbers that are not part of them."""
         if len(self.columns) == self.size:
             return step
-        zero, place = (
-            jnp.zeros_like(step[0]),
-            {column: POSE_SIZE + k for k, column in enumerate(self.columns)},
-        )
+        zero = jnp.zeros_like(step[0])
+        place = {column: POSE_SIZE + k for k, column in enumerate(self.columns)}
         lens = [step[place[k]] if k in place else zero for k in range(self.size)]
         return jnp.concatenate([step[:POSE_SIZE], jnp.stack(lens)])
 
@@ -171,9 +170,11 @@ def unknowns_of(
     at each position in layout order; out of range for padding. `fixed`: whether all intrinsics are
     constant. Some points of other shards may be constant (`agreement`). `capacity`: of a padded
     layout, whose shapes do not depend on what is constant and shared."""
-    cameras, points = len(problem.cameras), len(problem.points)
+    cameras = len(problem.cameras)
+    points = len(problem.points)
     lenses = problem.lenses or Lenses(np.arange(cameras), np.ones((cameras, LENS_SIZE), bool))
-    padding, index = len(seen) - cameras, np.asarray(lenses.index)
+    padding = len(seen) - cameras
+    index = np.asarray(lenses.index)
     poses_free = free_poses(problem)
     own_sizes = problem.residuals.sizes
     own_free = np.ones((cameras, sum(own_sizes)), bool)
@@ -192,7 +193,10 @@ def unknowns_of(
     )
     any_held = agreement.size("constant points", int(held.any()))
     apart = -1 - np.arange(len(seen))  # names of cameras that have nothing in common
-    padded = lambda names: np.where(seen, np.pad(names, (0, padding)), apart)
+
+    def padded(names):
+        return np.where(seen, np.pad(names, (0, padding)), apart)
+
     lens_room = capacity.lenses if capacity else 0
     lens_names = (
         padded(index) if not lens_room else np.where(seen, np.pad(index, (0, padding)), NO_LENS)

@@ -76,7 +76,8 @@ def make_env(
     rules = config.game if reward is None else replace(config.game, reward=reward)
     config = replace(config, game=rules)
     with numerics(np.float64), process.single_blas_thread():
-        key, limit = jax.random.key(config.seed), rules.max_iterations
+        key = jax.random.key(config.seed)
+        limit = rules.max_iterations
         split = make_split(
             config.bank, key, config.bank.options, limit, report, rules.tolerance, problems
         )
@@ -125,7 +126,10 @@ def train(
     loop = replace(env.preset.loop, steps_per_chunk=-(-rounds // chunks))
     config = replace(env.preset, seeds=seeds, seed=seed, chunks=chunks, evaluate_every=1, loop=loop)
     work = Task(config, env, env.held_out, {})
-    show = lambda rows: print(_line(rows, chunks), flush=True)
+
+    def show(rows):
+        return print(_line(rows, chunks), flush=True)
+
     hooks = driver.Hooks(rows=show) if verbose else driver.Hooks()
     with (
         tempfile.TemporaryDirectory() as temporary,

@@ -19,7 +19,8 @@ import numpy as np
 from jaxba.runtime.atomic import TEMPORARY, atomic_write
 from jaxba.typing import InputError
 
-_PREFIX, _SUFFIX = "step_", ".npz"
+_PREFIX = "step_"
+_SUFFIX = ".npz"
 _METADATA = "metadata"
 
 
@@ -42,10 +43,8 @@ def check(arrays: Mapping[str, Any], like: Any) -> None:
     for path, leaf in jax.tree_util.tree_flatten_with_path(like)[0]:
         if (name := _name(path)) not in arrays:
             raise TrainError(f"{name} is missing")
-        value, expected = (
-            arrays[name],
-            jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf,
-        )
+        value = arrays[name]
+        expected = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
         if (value.shape, value.dtype) != (expected.shape, expected.dtype):
             found, wanted = (f"{x.dtype}{list(x.shape)}" for x in (value, expected))
             raise TrainError(f"{name} is {found}, not {wanted}")

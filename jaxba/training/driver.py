@@ -180,9 +180,14 @@ class _Run:
         hooks: Hooks,
         loop: Future[Any],
     ) -> None:
-        self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
-        self.log, self.folder = folder, folder / CHECKPOINTS
-        self.chunk, self.wall_s = 0, 0.0
+        self.config = config
+        self.env = env
+        self.evaluate = evaluate
+        self.hooks = hooks
+        self.log = folder
+        self.folder = folder / CHECKPOINTS
+        self.chunk = 0
+        self.wall_s = 0.0
         self.evaluated = 0  # chunk after which the agents were evaluated last
         self.best: tuple[Best, ...] = ()
         like = _shapes(config, env)
@@ -270,10 +275,12 @@ class _Run:
         """One chunk, its evaluation if one is due, and its rows of the log. Whether the run is to
         end."""
         before = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        cpu = time.process_time()
         self.state, found = self._compiled(self.env, self.state)
         means = jax.tree.map(np.asarray, found)
-        seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        seconds = time.perf_counter() - wall
+        cpu = time.process_time() - cpu
         self.chunk += 1
         self.wall_s += seconds
         bad = np.flatnonzero(
@@ -324,7 +331,8 @@ class _Run:
     def _evaluate(self, actors: list[Any]) -> list[dict[str, float]]:
         """Metrics of every agent's policy, which is kept if it is better than all before of this
         agent."""
-        found, best = [], []
+        found = []
+        best = []
         for k, actor in enumerate(actors):
             scores = {name: float(value) for name, value in self.evaluate(actor).items()}
             better = not self.best or scores[SCORE] < self.best[k].score

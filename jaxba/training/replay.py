@@ -37,8 +37,11 @@ class Replay(NamedTuple):
 def init(capacity: int, observation_size: int, action_size: int) -> Replay:
     """An empty buffer; takes `4 capacity (2 observation_size + action_size + 2)` bytes."""
     rows = jnp.zeros((capacity, 2 * observation_size + action_size + 2), jnp.float32)
+
     # separate arrays, since a buffer can be donated only once
-    zero = lambda: jnp.zeros((), jnp.int32)
+    def zero():
+        return jnp.zeros((), jnp.int32)
+
     return Replay(rows, jnp.zeros(action_size, jnp.float32), zero(), zero(), zero())
 
 

@@ -113,10 +113,8 @@ def init(
     """An untrained agent. The key is that of the parameters and of all later random numbers. The
     actor does not see the last `privileged_size` features of an observation."""
     key, actor_key, critic_key, value_key = jax.random.split(key, 4)
-    observation, action = (
-        jnp.zeros((1, observation_size), jnp.float32),
-        jnp.zeros((1, action_size), jnp.float32),
-    )
+    observation = jnp.zeros((1, observation_size), jnp.float32)
+    action = jnp.zeros((1, action_size), jnp.float32)
     public = observation[:, : observation_size - privileged_size]
     observation = observation if config.privileged else public
     actor = _actor(config, action_size).init(actor_key, public)
@@ -176,13 +174,17 @@ def update(
         jnp.asarray(x, jnp.float32) for x in batch
     )
     inputs = networks.input_size(learner.actor)
-    public, next_public = observation[:, :inputs], next_observation[:, :inputs]
+    public = observation[:, :inputs]
+    next_public = next_observation[:, :inputs]
     if not config.privileged:
-        observation, next_observation = public, next_public
+        observation = public
+        next_observation = next_public
     key, next_key, policy_key = jax.random.split(learner.key, 3)
-    actor_network, critic_network = _actor(config, action.shape[-1]), _critic(config)
+    actor_network = _actor(config, action.shape[-1])
+    critic_network = _critic(config)
     temperature = jnp.exp(learner.log_temperature)
-    optimizer, optimizers = optax.adam(config.learning_rate), dict(learner.optimizers)
+    optimizer = optax.adam(config.learning_rate)
+    optimizers = dict(learner.optimizers)
 
     def step(name: str, params: Any, gradient: Any) -> Any:
         change, optimizers[name] = optimizer.update(gradient, optimizers[name], params)
@@ -225,7 +227,9 @@ def update(
         "temperature": temperature,
     }
 
-    log_temperature, value, source = learner.log_temperature, learner.value, critic
+    log_temperature = learner.log_temperature
+    value = learner.value
+    source = critic
     if config.learn_temperature:  # gradient of log_temperature (entropy - target_entropy)
         target_entropy = (
             -float(action.shape[-1]) if config.target_entropy is None else config.target_entropy

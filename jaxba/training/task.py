@@ -97,7 +97,8 @@ class Task:
 
     def compare(self, actors: Sequence[Any]) -> Comparison:
         """Trained policies beside the baselines, relative to the best costs of all."""
-        tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
+        tolerance = self.config.game.tolerance
+        limit = self.config.game.max_iterations
         names = [f"{TRAINED} {k + 1}" for k in range(len(actors))]
         steps = {
             name: (self.policy(actor), self.game.options)
@@ -108,8 +109,13 @@ class Task:
         found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
         each = {name: found.pop(name) for name in names}
         mean = Score(*(float(x) for x in np.mean(list(each.values()), axis=0)))
-        taken = lambda run: np.log(np.minimum(iterations_to(run, best, tolerance), limit))
-        ours, ratios, by_agent = np.stack([taken(alone[name]) for name in names]), {}, {}
+
+        def taken(run):
+            return np.log(np.minimum(iterations_to(run, best, tolerance), limit))
+
+        ours = np.stack([taken(alone[name]) for name in names])
+        ratios = {}
+        by_agent = {}
         for name, run in self.baseline_runs.items():
             theirs = taken(run)
             ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs))
@@ -139,7 +145,8 @@ def build(
         report("reading the scenes")
         split = read_split(path)
     else:
-        key, limit = jax.random.key(config.seed), config.game.max_iterations
+        key = jax.random.key(config.seed)
+        limit = config.game.max_iterations
         split = make_split(
             config.bank, key, config.bank.options, limit, report, config.game.tolerance
         )

@@ -97,7 +97,10 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
     env_state, observation = env.reset(reset_key)
     chex.assert_shape(observation, (env.num_envs, env.observation_size))
-    zero = lambda: jnp.zeros((), jnp.int32)
+
+    def zero():
+        return jnp.zeros((), jnp.int32)
+
     state = LoopState(
         learner=agent.init(
             sac, learner_key, env.observation_size, env.action_size, env.privileged_size
@@ -135,9 +138,10 @@ def run_chunk(
         key, act_key, sample_key = jax.random.split(state.key, 3)
         action, value, bonus = agent.act_with_value(sac, state.learner, state.observation, act_key)
         state, step = _play(env, state._replace(key=key), action)
-        learn = lambda learner, key: agent.update(
-            sac, learner, ring.sample(state.replay, key, sac.batch)
-        )
+
+        def learn(learner, key):
+            return agent.update(sac, learner, ring.sample(state.replay, key, sac.batch))
+
         keys = jax.random.split(sample_key, loop.updates_per_step)
         learner, learned = jax.lax.scan(learn, state.learner, keys)
         state = state._replace(learner=learner, updates=state.updates + loop.updates_per_step)

@@ -34,7 +34,8 @@ def lines(
     start = f"chunk {row['chunk']}/{chunks}: "
     text = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
     if ended := [one for one in rows if one["episodes"]]:
-        length, rule = _mean(ended, "episode/length"), _mean(ended, "episode/ceres")
+        length = _mean(ended, "episode/length")
+        rule = _mean(ended, "episode/ceres")
         text += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
     health = f"critics' loss {_mean(rows, 'critic_loss'):.2g}"
     if any(one["q_bias"] is not None for one in rows):
@@ -63,8 +64,13 @@ def _warning(rows: Sequence[Row], decades: float) -> list[str]:
     """What is said if some agents do the same in every state, or anything in every state."""
     same = [row for row in rows if decades * row["action_spread"] < SAME]
     random = [row for row in rows if row["entropy"] > MOST_ENTROPY - RANDOM]
-    who = lambda some: "this policy" if len(rows) == 1 else f"{len(some)} of {len(rows)} policies"
-    does = lambda some: "does" if len(rows) == 1 else "do"
+
+    def who(some):
+        return "this policy" if len(rows) == 1 else f"{len(some)} of {len(rows)} policies"
+
+    def does(some):
+        return "does" if len(rows) == 1 else "do"
+
     found = []
     if same:
         found.append(f"{who(same)} {does(same)} the same in every state ({_spread(same, decades)})")

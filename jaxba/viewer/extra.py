@@ -19,7 +19,8 @@ HOST = "127.0.0.1"  # address under which only this machine reaches the page
 def quietly(act: Callable[..., Any], **options: Any) -> Any:
     """Lets viser's server act without its words."""
     console = rich.get_console()
-    before, console.quiet = console.quiet, True
+    before = console.quiet
+    console.quiet = True
     try:
         return act(**options)
     finally:

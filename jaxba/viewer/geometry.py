@@ -44,9 +44,12 @@ def frusta_of(
     image: from the principal point, or where there is none as far as its observations reach."""
     numbers = np.asarray(problem.cameras)[:, POSE_SIZE:]
     count = len(numbers)
-    focal, center, flipped = np.ones((count, 2)), np.zeros((count, 2)), np.zeros(count, bool)
+    focal = np.ones((count, 2))
+    center = np.zeros((count, 2))
+    flipped = np.zeros(count, bool)
     lenses = problem.lenses
-    models, kind = (BAL,) if lenses is None else lenses.models, np.zeros(count, int)
+    models = (BAL,) if lenses is None else lenses.models
+    kind = np.zeros(count, int)
     if lenses is not None and lenses.model is not None:
         kind = np.asarray(lenses.model)[np.asarray(lenses.index)]
     for at, model in enumerate(models):
@@ -102,7 +105,8 @@ def residual_segments(
     own = np.flatnonzero(
         (np.asarray(problem.camera_index) == camera) & np.isfinite(residuals).all(axis=1)
     )
-    pixels, difference = np.asarray(problem.observations)[own], residuals[own]
+    pixels = np.asarray(problem.observations)[own]
+    difference = residuals[own]
     length = np.linalg.norm(difference, axis=1)
     diagonal = 2 * float(np.linalg.norm(frusta.half[camera] * frusta.focal[camera]))
     share = np.minimum(factor, diagonal / np.maximum(length, 1e-300))[:, None]
@@ -114,7 +118,9 @@ def residual_segments(
 def row_segments(problem: BundleProblem) -> list[Float[np.ndarray, "segments 2 3"]]:
     """For each residual besides those of pixels the segments between the two cameras or points that
     its rows have."""
-    centers, points, found = camera_centers(problem.cameras), np.asarray(problem.points), []
+    centers = camera_centers(problem.cameras)
+    points = np.asarray(problem.points)
+    found = []
     groups = block_groups(problem)
     for rows in problem.residuals.rows:
         owners = owners_of(problem, rows, groups)

@@ -22,7 +22,8 @@ class Layers:
     def __init__(
         self, server: viser.ViserServer, root: str, position: tuple[float, float, float]
     ) -> None:
-        self._scene, self._root = server.scene, root
+        self._scene = server.scene
+        self._root = root
         self._nodes: dict[str, Any] = {}
         self.frusta: dict[int, Any] = {}
         server.scene.add_frame(root, show_axes=False, position=position)
@@ -35,9 +36,12 @@ class Layers:
     def cloud(self, name: str, points: Float[np.ndarray, "n 3"], colours: Any, size: float) -> None:
         """Draws points, in one colour or one for each; what is not finite lies at the origin."""
         points = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
-        colours, node = np.asarray(colours, np.uint8), self._nodes.get(name)
+        colours = np.asarray(colours, np.uint8)
+        node = self._nodes.get(name)
         if node is not None and len(node.points) == len(points):
-            node.points, node.colors, node.point_size = points, colours, size
+            node.points = points
+            node.colors = colours
+            node.point_size = size
             return
         looks: dict[str, Any] = {
             "point_shape": "circle",
@@ -82,14 +86,14 @@ class Layers:
         quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()[[3, 0, 1, 2]]
         handle = self.frusta.get(camera)
         if handle is not None:
-            handle.wxyz, handle.position, handle.scale = quaternion, pose[:, 3], scale
+            handle.wxyz = quaternion
+            handle.position = pose[:, 3]
+            handle.scale = scale
             if handle.color != colour:
                 handle.color = colour
             return
-        name, size = (
-            f"{self._root}/cameras/{camera}",
-            {"fov": 2 * float(np.arctan(half[1])), "scale": scale},
-        )
+        name = f"{self._root}/cameras/{camera}"
+        size = {"fov": 2 * float(np.arctan(half[1])), "scale": scale}
         looks: Any = {
             "thickness": 1.5,
             "thickness_units": "screen",

@@ -39,7 +39,8 @@ class Viewer:
             host,
             quietly(viser.ViserServer, host=host, label="jaxba", verbose=False),
         )
-        self._lock, self._playing = threading.RLock(), False
+        self._lock = threading.RLock()
+        self._playing = False
         # where the last click met an image, and where the chosen one was taken
         self._hit = self._inside = None
         self.stages = stages(self.server, all_shown, SHOWN_POINTS, self._clicked)
@@ -80,36 +81,35 @@ class Viewer:
             }
             name = NOTHING if camera is None else words.entry(stage, camera)
             self._listed |= {} if camera is None else {name: (stage, camera)}
-            self._picked.options, self._picked.value = (NOTHING, *self._listed), name
+            self._picked.options = (NOTHING, *self._listed)
+            self._picked.value = name
             self._tell()
             if client is not None:
                 self._move(client, stage, camera)
 
     def _move(self, client: viser.ClientHandle, stage: Stage, camera: int | None) -> None:
-        start, view, self._inside = self.server.initial_camera, client.camera, None
+        start = self.server.initial_camera
+        view = client.camera
+        self._inside = None
         if camera is None:
-            place, target, up, fov, near = (
-                start.position,
-                start.look_at,
-                (0.0, 0.0, 1.0),
-                start.fov,
-                start.near,
-            )
+            place = start.position
+            target = start.look_at
+            up = (0.0, 0.0, 1.0)
+            fov = start.fov
+            near = start.near
         else:
             pose, half, depth = stage.view_of(camera)
-            place, up, near = pose[:, 3] + stage.place, -pose[:, 1], NEAR * depth
-            target, fov = (
-                place + depth * pose[:, 2],
-                2 * np.arctan(1.05 * max(half[1], half[0] / view.aspect)),
-            )
+            place = pose[:, 3] + stage.place
+            up = -pose[:, 1]
+            near = NEAR * depth
+            target = place + depth * pose[:, 2]
+            fov = 2 * np.arctan(1.05 * max(half[1], half[0] / view.aspect))
             self._inside = place
-        view.position, view.look_at, view.up_direction, view.fov, view.near = (
-            place,
-            target,
-            up,
-            float(fov),
-            near,
-        )
+        view.position = place
+        view.look_at = target
+        view.up_direction = up
+        view.fov = float(fov)
+        view.near = near
 
     def _clicked(self, place: int, camera: int, event: viser.SceneNodePointerEvent) -> None:
         if not self._is_inside(event.client):  # there a click is on a point
@@ -139,23 +139,24 @@ class Viewer:
     def grow(self, recording: Recording) -> None:
         """Shows the last iteration of a solve that is running, unless another one is being looked
         at."""
-        shown, last = self.stages[0].shown, recording.last
+        shown = self.stages[0].shown
+        last = recording.last
         newest = self.stages[0].iteration == shown.recording.last
         self._change(shown=replace(shown, recording=recording))
-        self._slider.max, self._slider.visible, self._play.visible = (
-            max(last, 1),
-            last > 0,
-            last > 0,
-        )
+        self._slider.max = max(last, 1)
+        self._slider.visible = last > 0
+        self._play.visible = last > 0
         if newest:
             self._slider.value = last
 
     def _panel(self) -> None:
-        gui, last = self.server.gui, max(stage.shown.recording.last for stage in self.stages)
+        gui = self.server.gui
+        last = max(stage.shown.recording.last for stage in self.stages)
         gui.main_panel.dock_right()
-        dress = lambda dark: gui.configure_theme(
-            show_share_button=False, show_logo=False, dark_mode=dark
-        )
+
+        def dress(dark):
+            return gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=dark)
+
         dress(False)
         lines = [
             f"**{words.plain(stage.shown.name)}**: {words.sizes(stage)}" for stage in self.stages
@@ -204,7 +205,10 @@ class Viewer:
         slider = self.server.gui.add_multi_slider(
             label, low, high, 1 if low else high / 200, (low, high)
         )
-        ends = lambda least, most: (least if least > low else 0.0, most if most < high else np.inf)
+
+        def ends(least, most):
+            return (least if least > low else 0.0, most if most < high else np.inf)
+
         slider.on_update(lambda _: self._change(**{name: ends(*slider.value)}))
 
     def _run(self) -> None:
@@ -224,7 +228,8 @@ class Viewer:
         from PIL import Image
 
         assert event.client is not None  # it has clicked
-        view, file = event.client.camera, io.BytesIO()
+        view = event.client.camera
+        file = io.BytesIO()
         Image.fromarray(event.client.get_render(view.image_height, view.image_width)).save(
             file, "PNG"
         )

@@ -16,7 +16,8 @@ from jaxba.viewer.words import meaning, numbers, sizes, worst_images
 
 PAGE_POINTS, LISTED = 50_000, 5  # most points on a page in a file, and worst images that it names
 # seconds for which an iteration is shown; shift of the view to the left, where the words are
-FRAME_S, LEFT = 1.0, 0.4
+FRAME_S = 1.0
+LEFT = 0.4
 
 WORDS = """<details open style="position:fixed;left:8px;top:8px;max-width:24em;padding:4px 8px;
 font:12px sans-serif;color-scheme:light dark;background:Canvas;color:CanvasText;opacity:.85;
@@ -35,7 +36,8 @@ shows, and more."""
 def page_of(all_shown: Sequence[Shown]) -> str:
     """A page that plays the iterations of all solves, in step; the worst image at the end is
     marked."""
-    server, words = quietly(viser.ViserServer, host=HOST, verbose=False), []
+    server = quietly(viser.ViserServer, host=HOST, verbose=False)
+    words = []
     try:
         drawn = stages(server, all_shown, PAGE_POINTS)
         server.initial_camera.position -= (LEFT, 0, 0)
@@ -76,16 +78,15 @@ def stages(
     """Draws problems and solves side by side, with at most so many points together, and turns the
     camera to them. A click on an image calls `clicked` with the numbers of its stage and itself,
     and the event."""
-    share, found = max(points // len(all_shown), 1), []
+    share = max(points // len(all_shown), 1)
+    found = []
     for place, one in enumerate(all_shown):
         click = None if clicked is None else partial(clicked, place)
         found.append(Stage(server, one, place, share, click, len(all_shown) > 1))
     middle = ASIDE * (len(all_shown) - 1) / 2
     away = 2.2 + 1.2 * middle
-    server.initial_camera.position, server.initial_camera.look_at = (
-        (middle, -away, 0.7 * away),
-        (middle, 0.0, 0.0),
-    )
+    server.initial_camera.position = (middle, -away, 0.7 * away)
+    server.initial_camera.look_at = (middle, 0.0, 0.0)
     return found
 
 

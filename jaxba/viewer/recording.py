@@ -66,7 +66,8 @@ def evenly(count: int, limit: int) -> Int[np.ndarray, " kept"]:
 def of_points(problem: BundleProblem, kept: Int[np.ndarray, " kept"]) -> BundleProblem:
     """A problem of some of the points, their observations and other rows, for looking at: without
     constants."""
-    labels, none = problem.labels, dict.fromkeys(("whitening", "constants", "rigs"))
+    labels = problem.labels
+    none = dict.fromkeys(("whitening", "constants", "rigs"))
     found = problem.replace(**none).subset(np.isin(problem.point_index, kept), points=kept)
     labels = labels and Labels(labels.names, labels.images, labels.lenses, labels.points[kept])
     return found.replace(cameras=np.asarray(problem.cameras), labels=labels)
@@ -74,8 +75,10 @@ def of_points(problem: BundleProblem, kept: Int[np.ndarray, " kept"]) -> BundleP
 
 def still(problem: BundleProblem) -> Recording:
     """A recording of no iterations, of the whole problem."""
-    none, zero = np.array([np.nan]), np.zeros(1)
-    cameras, points = np.asarray(problem.cameras), np.asarray(problem.points)
+    none = np.array([np.nan])
+    zero = np.zeros(1)
+    cameras = np.asarray(problem.cameras)
+    points = np.asarray(problem.points)
     return Recording(
         problem, len(points), cameras[None], points[None], np.zeros(1, int), none, none, none, zero
     )
@@ -124,8 +127,10 @@ _HISTORY = ("cameras", "state", "cost", "damping", "gain_ratio", "time_s")
 def write_recording(recording: Recording, path: StrPath) -> None:
     """Writes a recording, whole or not at all; points are float32 from their middle. Raises
     ProblemError."""
-    problem, lenses = recording.problem, recording.problem.lenses
-    middle, limits = np.median(recording.points[-1], axis=0), np.finfo(np.float32)
+    problem = recording.problem
+    lenses = recording.problem.lenses
+    middle = np.median(recording.points[-1], axis=0)
+    limits = np.finfo(np.float32)
     arrays: dict[str, Any] = {name: getattr(problem, name) for name in _ARRAYS}
     arrays |= {name: getattr(recording, name) for name in _HISTORY}
     points = np.clip(recording.points - middle, limits.min, limits.max)  # some run away
@@ -185,7 +190,8 @@ def _check(
     problem: BundleProblem, points: np.ndarray, history: dict[str, np.ndarray], names: int
 ) -> None:
     """Raises a ValueError if the parts of a recording do not fit each other."""
-    state, cameras = history["state"], history["cameras"]
+    state = history["state"]
+    cameras = history["cameras"]
     rows = [
         history[key].shape == (len(state),)
         for key in ("state", "cost", "damping", "gain_ratio", "time_s")

@@ -64,7 +64,8 @@ class Shown:
             lack = np.rint(
                 (1 - 2 * self.looks.principal[camera] / self.looks.sizes[camera]) * image.size
             ).astype(int)
-            (left, top), (right, bottom) = np.maximum(lack, 0), np.maximum(-lack, 0)
+            (left, top) = np.maximum(lack, 0)
+            (right, bottom) = np.maximum(-lack, 0)
             return np.pad(pixels, ((top, bottom), (left, right), (0, 0)), constant_values=255)
 
         return self._opened(camera, small)

@@ -18,22 +18,23 @@ from jaxba.viewer.recording import evenly
 from jaxba.viewer.sources import Shown
 
 # most on a page; software rendering draws them at a few frames a second
-SHOWN_POINTS, SHOWN_FRUSTA = 200_000, 500
+SHOWN_POINTS = 200_000
+SHOWN_FRUSTA = 500
 POINT_SIZE = 0.006  # of points; scenes have a size of about one
 # distance between neighbouring stages, and where the name of one of several is
-ASIDE, ABOVE = 3.0, (0.0, 0.0, 1.3)
-FILE, ERROR, TRACK, IMAGE = (
-    "colour of the file",
-    "reprojection error",
-    "track length",
-    "error of images",
-)
+ASIDE = 3.0
+ABOVE = (0.0, 0.0, 1.3)
+FILE = "colour of the file"
+ERROR = "reprojection error"
+TRACK = "track length"
+IMAGE = "error of images"
 CHOSEN, RESIDUAL = (255, 120, 0), (208, 0, 0)  # colours of what is chosen, and of its residuals
 CHOSEN_SIDE = 1600  # pixels of the longer side of the chosen image
 # colours of residuals besides those of pixels. Source: Okabe and Ito 2008, "Color Universal Design"
 KINDS = ((0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (213, 94, 0))
 # shares: depth of residuals in their image's, median length in its width
-BEFORE, TYPICAL = 0.99, 0.015
+BEFORE = 0.99
+TYPICAL = 0.015
 
 
 class Stage:
@@ -50,22 +51,29 @@ class Stage:
     ) -> None:
         """Draws the last iteration, with at most so many points. `place` counts those side by
         side."""
-        self.shown, self._server, self._clicked = shown, server, clicked
-        self.iteration, self.point_size, self.enlarged = shown.recording.last, POINT_SIZE, 1.0
+        self.shown = shown
+        self._server = server
+        self._clicked = clicked
+        self.iteration = shown.recording.last
+        self.point_size = POINT_SIZE
+        self.enlarged = 1.0
         self.chosen: int | None = None
         self.tracked: int | None = None
         self.errors, self.lengths, self.named = (0.0, np.inf), (0.0, np.inf), False
         self.place = np.array([ASIDE * place, 0.0, 0.0])
         self.points = evenly(shown.problem.num_points, points)
         self.frusta = evenly(shown.problem.num_cameras, SHOWN_FRUSTA)
-        last, looks, sizes = self.problem, shown.looks, None
+        last = self.problem
+        looks = shown.looks
+        sizes = None
         if looks is not None:  # with margins that put principal points in the middle
             sizes = np.where(
                 looks.sizes > 0, 2 * np.maximum(looks.principal, looks.sizes - looks.principal), 0.0
             )
         self._file_colours = None if looks is None else looks.colours
         self.colour = self.colour_choices()[0]
-        self._similarity, self._measured = upright(last), (-1, measure(last))
+        self._similarity = upright(last)
+        self._measured = (-1, measure(last))
         self.image_planes = geometry.frusta_of(last, sizes)
         self._size = self._size_of_frusta(last)
         self.layers = Layers(server, f"/{place + 1}", tuple(self.place))
@@ -129,8 +137,11 @@ class Stage:
     def kept(self) -> np.ndarray:
         """The points that are drawn: those between the limits of reprojection errors and track
         lengths."""
+
         # NaN is within
-        within = lambda values, limits: ~((values < limits[0]) | (values > limits[1]))
+        def within(values, limits):
+            return ~((values < limits[0]) | (values > limits[1]))
+
         keep = within(self.measures.of_point, self.errors) & within(
             self.measures.tracks, self.lengths
         )
@@ -167,16 +178,12 @@ class Stage:
         return missing
 
     def _draw(self) -> None:
-        layers, problem, measures, similarity = (
-            self.layers,
-            self.problem,
-            self.measures,
-            self._similarity,
-        )
-        points, poses = (
-            similarity.points(np.asarray(problem.points)),
-            similarity.poses(camera_poses(problem.cameras)),
-        )
+        layers = self.layers
+        problem = self.problem
+        measures = self.measures
+        similarity = self._similarity
+        points = similarity.points(np.asarray(problem.points))
+        poses = similarity.poses(camera_poses(problem.cameras))
         with self._server.atomic():
             kept = self.kept()
             name = TRACK if self.colour == TRACK else ERROR
@@ -232,7 +239,8 @@ class Stage:
     def _residuals(self, camera: int) -> np.ndarray:
         """Residuals of an image as segments on the page, just before it."""
         pose, _, depth = self.view_of(camera)
-        planes, residuals = self.image_planes, self.measures.residuals
+        planes = self.image_planes
+        residuals = self.measures.residuals
         segments = geometry.residual_segments(
             self.problem, planes, residuals, camera, self.magnified
         )

@@ -11,7 +11,8 @@ from jaxba.model.registration import costs_of_rows
 from jaxba.viewer.stage import ERROR, FILE, KINDS, Stage
 
 # images in the list of the worst; rows of a residual, and images that see a point
-WORST, WORST_ROWS = 20, 5
+WORST = 20
+WORST_ROWS = 5
 
 
 def plain(name: str) -> str:
@@ -22,12 +23,14 @@ def plain(name: str) -> str:
 
 def sizes(stage: Stage) -> str:
     """Sizes of what is shown, and how much of it."""
-    recording, problem = stage.shown.recording, stage.shown.problem
-    part = lambda shown, whole: f"{shown:,}" if shown == whole else f"{shown:,} of {whole:,}"
-    images, points = (
-        part(len(stage.frusta), problem.num_cameras),
-        part(len(stage.points), recording.whole),
-    )
+    recording = stage.shown.recording
+    problem = stage.shown.problem
+
+    def part(shown, whole):
+        return f"{shown:,}" if shown == whole else f"{shown:,} of {whole:,}"
+
+    images = part(len(stage.frusta), problem.num_cameras)
+    points = part(len(stage.points), recording.whole)
     of = " of these points" if recording.whole > problem.num_points else ""
     return f"{images} images, {points} points, {problem.num_observations:,} observations{of}"
 
@@ -48,7 +51,8 @@ def entry(stage: Stage, camera: int) -> str:
 
 def numbers(stage: Stage) -> str:
     """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error."""
-    recording, k = stage.shown.recording, stage.iteration
+    recording = stage.shown.recording
+    k = stage.iteration
     error = f"RMSE {stage.measures.rmse:.4g} px"
     if recording.last == 0:
         return error
@@ -71,12 +75,14 @@ def meaning(stage: Stage) -> str:
 def about_rows(stage: Stage) -> list[str]:
     """For each residual besides those of pixels its colour, its cost and its worst rows, at the
     iteration shown."""
-    rows, lines = stage.problem.residuals.rows, []
+    rows = stage.problem.residuals.rows
+    lines = []
     for number, costs in enumerate(costs_of_rows(stage.problem) if rows else ()):
         worst = ", ".join(
             f"{row} ({costs[row]:.3g})" for row in np.argsort(-costs, kind="stable")[:WORST_ROWS]
         )
-        colour, name = KINDS[number % len(KINDS)], plain(rows[number].residual.name)
+        colour = KINDS[number % len(KINDS)]
+        name = plain(rows[number].residual.name)
         cost = f"cost {costs.sum():.5g} of {len(costs):,} rows; the worst: {worst}"
         lines.append(f'<font color="rgb{colour}">●</font> **{name}**: {cost}')
     return lines
@@ -84,7 +90,8 @@ def about_rows(stage: Stage) -> list[str]:
 
 def about_image(stage: Stage, camera: int) -> str:
     """How well an image fits."""
-    name, measures = plain(stage.shown.name_of(camera)), stage.measures
+    name = plain(stage.shown.name_of(camera))
+    measures = stage.measures
     fits = f"{measures.seen[camera]:,} observations, RMSE {measures.of_image[camera]:.3g} px"
     drawn = "times as long as they are, in all images, from the measured pixel to the predicted one"
     return f"**{name}**: {fits}. Residuals are drawn {stage.magnified:.3g} {drawn}."
@@ -95,7 +102,10 @@ def about_track(stage: Stage, point: int) -> str:
     rows = np.flatnonzero(np.asarray(stage.problem.point_index) == point)
     errors = np.linalg.norm(stage.measures.residuals[rows], axis=1)
     order = np.argsort(-errors, kind="stable")[:WORST_ROWS]
-    name = lambda row: plain(stage.shown.name_of(int(stage.problem.camera_index[row])))
+
+    def name(row):
+        return plain(stage.shown.name_of(int(stage.problem.camera_index[row])))
+
     seen = ", ".join(f"{errors[k]:.3g} px in {name(rows[k])}" for k in order)
     return (
         f"**point {point}**: {len(rows)} images, RMSE {stage.measures.of_point[point]:.3g} px; "

@@ -24,7 +24,8 @@ def make_record(
     problem, solver, iterations, *, rate=0.3, floor=100.0, damping=0.25, termination="ftol"
 ):
     """A run that approaches `floor` geometrically; every fourth iteration is rejected."""
-    cost, points = 1000.0, [TracePoint(0, 0.0, 1000.0, math.nan, True, 0, math.nan)]
+    cost = 1000.0
+    points = [TracePoint(0, 0.0, 1000.0, math.nan, True, 0, math.nan)]
     for i in range(1, iterations + 1):
         ok = i % 4 != 0
         cost = floor + (cost - floor) * rate if ok else cost
@@ -58,7 +59,9 @@ class Tags(HTMLParser):
 
     def __init__(self):
         super().__init__()
-        self.stack, self.sources, self.scripts = [], [], []
+        self.stack = []
+        self.sources = []
+        self.scripts = []
 
     def handle_starttag(self, tag, attrs):
         self.sources += [value for key, value in attrs if key in ("src", "href")]
@@ -221,7 +224,10 @@ def test_convergence_charts_have_dashed_lines_at_the_tolerances():
     cost, distance, _ = charts.problem_charts(
         [make_record("a", "x", 30)], "a", 1e-2, charts.solver_styles("x")
     )
-    heights = lambda chart: sorted(shape["y0"] for shape in chart["layout"]["shapes"])
+
+    def heights(chart):
+        return sorted(shape["y0"] for shape in chart["layout"]["shapes"])
+
     assert heights(cost) == pytest.approx([100.9, 109.0, 190.0])
     assert heights(distance) == pytest.approx([1e-4, 1e-3, 1e-2])
 

@@ -36,7 +36,8 @@ def alone(game):
 
 
 def test_the_base_policy_takes_the_iterations_that_it_takes_in_an_evaluation(game, alone):
-    bank, rules = game.bank, game.config
+    bank = game.bank
+    rules = game.config
     run = play(
         KIND, bank, POLICY, CONFIG.step_options(StepOptions()), rules.max_iterations, ftol=0.0
     )

@@ -212,7 +212,8 @@ def test_a_folder_without_checksums_is_continued(folder, undrawn, capsys):
 
 
 def test_another_policy_in_the_same_file_may_not_continue_in_the_folder(folder, undrawn, capsys):
-    mine, shipped = folder.parent / "mine.safetensors", jaxba.load_policy(SHIPPED)
+    mine = folder.parent / "mine.safetensors"
+    shipped = jaxba.load_policy(SHIPPED)
     argv = ["scene:tiny", "--solvers", str(mine), "--repeats", "1", "--max-iterations", "5"]
     jaxba.save_policy(mine, shipped)
     assert bench(folder, *argv) == 0
@@ -300,7 +301,8 @@ def test_every_repeat_has_its_line(tmp_path, undrawn, capsys):
 def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(
     tmp_path, undrawn, capsys
 ):
-    good, bad = tmp_path / "good.txt", tmp_path / "bad.txt"
+    good = tmp_path / "good.txt"
+    bad = tmp_path / "bad.txt"
     write_bal(support.tiny(), good)
     bad.write_bytes(good.read_bytes()[:500])
     status = bench(tmp_path / "run", str(bad), str(good), *BRIEF)
@@ -312,7 +314,9 @@ def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(
 
 
 def test_a_bad_file_that_was_repaired_is_solved_in_the_same_folder(tmp_path, undrawn, capsys):
-    good, bad, folder = tmp_path / "good.txt", tmp_path / "bad.txt", tmp_path / "run"
+    good = tmp_path / "good.txt"
+    bad = tmp_path / "bad.txt"
+    folder = tmp_path / "run"
     write_bal(support.tiny(), good)
     bad.write_bytes(good.read_bytes()[:500])
     bench(folder, str(bad), str(good), *BRIEF)

@@ -94,11 +94,13 @@ def test_repairs_and_the_smallest_gain_may_be_others_than_those_of_the_policy():
 
 
 def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
-    output, log = tmp_path / "out.txt.bz2", tmp_path / "log.json"
+    output = tmp_path / "out.txt.bz2"
+    log = tmp_path / "log.json"
     assert run([str(tiny), "--output", str(output), "--log", str(log)]) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
-    solved, record = read_bal(output), json.loads(log.read_text())
+    solved = read_bal(output)
+    record = json.loads(log.read_text())
     assert list(record) == RECORD_KEYS
     np.testing.assert_allclose(record["initial_cost"], geometry.cost(support.tiny()), rtol=1e-10)
     np.testing.assert_allclose(record["final_cost"], geometry.cost(solved), rtol=1e-10)
@@ -138,18 +140,18 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
 @pytest.mark.slow
 def test_a_search_for_points_is_reported_and_rows_are_numbered_consecutively(tmp_path, capsys):
     """One point behind its cameras, with which the solve alone converges far above the minimum."""
-    problem, log = solve(support.tiny()).problem, tmp_path / "log.json"
-    points, center = (
-        np.array(problem.points),
-        geometry.camera_centers(problem.cameras)[problem.camera_index[0]],
-    )
+    problem = solve(support.tiny()).problem
+    log = tmp_path / "log.json"
+    points = np.array(problem.points)
+    center = geometry.camera_centers(problem.cameras)[problem.camera_index[0]]
     points[0] = center - 3 * (points[0] - center)
     write_bal(problem.replace(points=points), tmp_path / "strayed.txt")
     stranding = ["--policy", "ceres", "--refine-points", "3"]
     assert (
         run([str(tmp_path / "strayed.txt"), *stranding, "--retriangulate", "--log", str(log)]) == 0
     )
-    printed, record = capsys.readouterr().out, json.loads(log.read_text())
+    printed = capsys.readouterr().out
+    record = json.loads(log.read_text())
     searches = re.findall(
         r"^   search for points at other depths: (\d+) of 40 points moved, cost (.*) -> (.*)$",
         printed,
@@ -200,7 +202,8 @@ def test_the_iteration_limit_is_reported_and_not_an_error(tiny, tmp_path, capsys
 
 
 def test_without_iterations_the_cost_is_printed_and_the_problem_converted(tiny, tmp_path, capsys):
-    output, model = tmp_path / "same.txt", tmp_path / "model"
+    output = tmp_path / "same.txt"
+    model = tmp_path / "model"
     assert (
         run(
             [
@@ -326,7 +329,8 @@ def test_an_option_of_the_step_leaves_the_others_as_the_policy_was_trained():
 def test_fixed_intrinsics_are_bitwise_unchanged_and_the_rest_is_optimised(tiny, tmp_path):
     out = tmp_path / "out.txt"
     assert run([str(tiny), "--intrinsics", "fixed", "--output", str(out)]) == 0
-    before, after = read_bal(tiny), read_bal(out)
+    before = read_bal(tiny)
+    after = read_bal(out)
     np.testing.assert_array_equal(after.cameras[:, 6:], before.cameras[:, 6:])
     assert (after.cameras[:, :6] != before.cameras[:, :6]).any(axis=1).all()
     assert geometry.cost(after) < 0.5 * geometry.cost(before)
@@ -334,7 +338,8 @@ def test_fixed_intrinsics_are_bitwise_unchanged_and_the_rest_is_optimised(tiny, 
 
 def test_notes_on_the_data_have_the_right_counts(tmp_path, capsys):
     problem = support.odd()
-    path, output = tmp_path / "odd.txt", tmp_path / "out.txt"
+    path = tmp_path / "odd.txt"
+    output = tmp_path / "out.txt"
     write_bal(problem, path)
     assert run([str(path), "--output", str(output)]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
@@ -391,7 +396,8 @@ def test_a_start_without_a_finite_cost_is_reported(tmp_path, capsys):
     problem = support.single().replace(
         cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]])
     )
-    path, log = tmp_path / "plane.txt", tmp_path / "log.json"
+    path = tmp_path / "plane.txt"
+    log = tmp_path / "log.json"
     write_bal(problem, path)
     status = run([str(path), "--log", str(log)])
     printed = capsys.readouterr()
@@ -439,7 +445,8 @@ def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monk
 
 
 def test_the_solution_is_written_if_the_reader_of_stdout_closes_it(tiny, tmp_path, monkeypatch):
-    output, (reader, writer) = tmp_path / "out.txt", os.pipe()
+    output = tmp_path / "out.txt"
+    (reader, writer) = os.pipe()
     os.close(reader)
     with open(writer, "w") as closed:
         monkeypatch.setattr(sys, "stdout", closed)
@@ -493,7 +500,9 @@ def test_not_enough_memory_is_one_line(tiny, capsys, monkeypatch):
 
 
 def test_a_log_is_written_to_the_target_of_a_link_and_to_a_pipe(tiny, tmp_path):
-    target, link, pipe = tmp_path / "log.json", tmp_path / "link.json", tmp_path / "pipe"
+    target = tmp_path / "log.json"
+    link = tmp_path / "link.json"
+    pipe = tmp_path / "pipe"
     link.symlink_to(target)
     os.mkfifo(pipe)
     fast = [str(tiny), "--max-iterations", "1"]

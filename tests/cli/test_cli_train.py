@@ -194,7 +194,10 @@ def test_an_interrupted_run_continues_with_the_same_results(folder, finished, ca
         assert run(["--out", str(folder), "--resume"]) == 130
     assert "interrupted; go on with" in capsys.readouterr().out
     assert run(["--out", str(folder), "--resume"]) == 0
-    plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
+
+    def plain(row):
+        return {k: v for k, v in row.items() if k not in CLOCKS}
+
     assert list(map(plain, log.read(folder))) == list(map(plain, log.read(finished)))
     ours, theirs = (
         load_policy(run_folder / "policy.safetensors") for run_folder in (folder, finished)

@@ -173,7 +173,8 @@ def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_pat
         "free\n",
         encoding="utf-16",  # as older editors of Windows save text
     )
-    out, spread = str(tmp_path / "out"), tmp_path / "c.npz"
+    out = str(tmp_path / "out")
+    spread = tmp_path / "c.npz"
     words = [
         "--constraints",
         str(tmp_path / "c.yaml"),
@@ -289,7 +290,8 @@ def test_positions_of_other_images_are_left_out_with_a_note(model, tmp_path):
     from jaxba.cli.common import UsageError
     from jaxba.problem import geometry
 
-    problem, file = read_problem(model), tmp_path / "log.yaml"
+    problem = read_problem(model)
+    file = tmp_path / "log.yaml"
     centers = geometry.camera_centers(problem.cameras)
     rows = {name: at for name, at in zip(problem.labels.names[:5], centers.tolist(), strict=False)}
     rows |= {f"later{k}.jpg": [0, 0, 0] for k in range(6)}

@@ -84,7 +84,8 @@ def test_the_written_model_has_no_point_more_or_less(solved):
 def test_a_survey_from_python_is_that_of_the_command(solved, tmp_path):
     """A mapping with numbers, and files elsewhere, gives the scene, the report and the model of the
     file."""
-    folder, text = solved.folder, (solved.folder / "c.yaml").read_text()
+    folder = solved.folder
+    text = (solved.folder / "c.yaml").read_text()
     checks = [f"gcp{one}" for one in range(CONTROLS, CONTROLS + CHECKS)]
     assert f"stddev: {SURVEYED}, pixels: {CLICKED}, check: [{', '.join(checks)}]" in text
     accuracy = {"stddev": np.full(3, SURVEYED), "pixels": CLICKED}
@@ -149,7 +150,8 @@ def test_a_mark_with_the_pixels_of_a_point_is_where_that_is(refined, solved, tmp
     """With BAL's lenses, whose pixels count from the principal point, and with COLMAP's."""
     folder = solved.folder / "out"
     model = jaxba.read_colmap(folder, refine_principal_point=True)
-    lines, points = ["local"], np.argsort(-np.bincount(model.point_index))[:3]
+    lines = ["local"]
+    points = np.argsort(-np.bincount(model.point_index))[:3]
     for at in np.flatnonzero(np.isin(model.point_index, points)):
         x, y = model.observations[at]
         lines.append(
@@ -184,10 +186,8 @@ def test_the_report_is_printed(solved, capsys):
 def test_distances_and_points_by_id_are_in_the_report(block, tmp_path, capsys):
     model = jaxba.read_colmap(block.folder / "model")
     first, second = model.labels.points[:2].tolist()
-    length, place = (
-        float(np.linalg.norm(model.points[1] - model.points[0])),
-        model.points[0].tolist(),
-    )
+    length = float(np.linalg.norm(model.points[1] - model.points[0]))
+    place = model.points[0].tolist()
     text = f"distances: [{{points: [{first}, {second}], length: {length + 0.25}, stddev: 0.125}}]\n"
     (tmp_path / "c.yaml").write_text(
         f"{text}control_points: {{positions: {{{first}: {place}}}, stddev: 0.1}}\n"
@@ -239,7 +239,8 @@ def test_positions_give_the_scene_that_they_give_colmap(block, tmp_path):
     (rows,) = problem.residuals.rows
     found = support.solve(problem).problem
     model = pycolmap.Reconstruction(block.folder / "model")
-    config, priors = pycolmap.BundleAdjustmentConfig(), []
+    config = pycolmap.BundleAdjustmentConfig()
+    priors = []
     for at, place in zip(*map(np.asarray, (rows.index[0], rows.data[0])), strict=True):
         image = model.image(int(problem.labels.images[at]))
         config.add_image(image.image_id)
@@ -267,7 +268,8 @@ def test_wrong_matches_and_clicks_are_rejected_and_check_points_are_as_far_off_a
 ):
     """A fifth of the matches is anywhere, a click of a control point is wrong, and one of the two
     of a check point."""
-    model, rng = jaxba.read_colmap(solved.folder / "model"), np.random.default_rng(1)
+    model = jaxba.read_colmap(solved.folder / "model")
+    rng = np.random.default_rng(1)
     pixels = np.array(model.observations)
     edge = np.ceil(np.abs(pixels).max(axis=0))  # which says how large the written images are
     wrong = (rng.random(len(pixels)) < 0.2) & (np.ceil(np.abs(pixels)) < edge).all(axis=1)
@@ -276,7 +278,10 @@ def test_wrong_matches_and_clicks_are_rejected_and_check_points_are_as_far_off_a
     lines = [
         line.split() for line in (solved.folder / "gcp_list.txt").read_text().split("\n")[1:-1]
     ]
-    of = lambda name: [at for at, line in enumerate(lines) if line[6] == name]
+
+    def of(name):
+        return [at for at, line in enumerate(lines) if line[6] == name]
+
     for at in (of("gcp0")[0], of("gcp5")[0]):
         # across the strip, along which the next image is
         lines[at][4] = str(float(lines[at][4]) + 40)
@@ -295,9 +300,12 @@ def test_wrong_matches_and_clicks_are_rejected_and_check_points_are_as_far_off_a
     )
     assert int(rows["gcp0"]["images"]) == int(without["gcp0"]["images"]) - 1
     assert (rows["gcp5"]["images"], rows["gcp5"]["dx"]) == ("0", "nan")
-    places = lambda rows: np.array(
-        [[float(row[f"d{axis}"]) for axis in "xyz"] for row in rows.values()]
-    )[CONTROLS + 1 :]
+
+    def places(rows):
+        return np.array([[float(row[f"d{axis}"]) for axis in "xyz"] for row in rows.values()])[
+            CONTROLS + 1 :
+        ]
+
     assert 0.8 < rms(places(rows)) / rms(places(without)) < 1.25
     after = jaxba.read_colmap(tmp_path / "out")
     assert after.num_observations < 1.01 * np.sum(~wrong)

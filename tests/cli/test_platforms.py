@@ -43,9 +43,12 @@ def test_a_torn_program_of_the_cache_is_compiled_again_without_a_word_and_replac
         *options,
     ]
     env = {**os.environ, "JAXBA_CACHE": str(tmp_path / "programs"), "JAX_COMPILATION_CACHE_DIR": ""}
-    run = lambda: subprocess.run(
-        command, env=env, capture_output=True, text=True, timeout=120, check=True
-    )
+
+    def run():
+        return subprocess.run(
+            command, env=env, capture_output=True, text=True, timeout=120, check=True
+        )
+
     whole = run().stdout.splitlines()[-3:]
     largest = max((tmp_path / "programs").rglob(files), key=lambda path: path.stat().st_size)
     os.truncate(largest, 1000)

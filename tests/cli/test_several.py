@@ -80,7 +80,8 @@ def test_what_is_only_read_is_written_as_a_bal_file_and_a_folder_of_opensfm_is_o
 
 
 def test_a_run_goes_on_where_it_was_also_after_a_line_that_was_cut(problems, tmp_path, capsys):
-    output, paths = tmp_path / "solved", sorted(map(str, problems.iterdir()))
+    output = tmp_path / "solved"
+    paths = sorted(map(str, problems.iterdir()))
     assert run([*paths[:2], "--output", str(output), *ASKED]) == 0
     first = rows(output)
     assert run([*paths, "--output", str(output), *ASKED]) == 2
@@ -123,7 +124,8 @@ def test_a_run_does_not_go_on_by_other_options(problems, tmp_path, more, capsys)
 
 def test_a_run_does_not_go_on_by_constraints_whose_files_have_changed(problems, tmp_path, capsys):
     output = tmp_path / "solved"
-    constraints, log = tmp_path / "constraints.yaml", tmp_path / "log.csv"
+    constraints = tmp_path / "constraints.yaml"
+    log = tmp_path / "log.csv"
     constraints.write_text("constant_points: [3]\nposition_priors: {file: log.csv, stddev: 5}\n")
     positions = [f"{number},{number % 3},{number},0.{number}" for number in range(6)]
     log.write_text("\n".join(["image,x,y,z", *positions]) + "\n")
@@ -184,7 +186,8 @@ def test_an_error_that_nobody_expects_comes_after_the_solutions_of_what_was_read
 def test_a_run_goes_on_with_names_of_any_bytes_and_costs_that_an_editor_or_a_crash_has_touched(
     problems, tmp_path, capsys
 ):
-    output, first = tmp_path / "solved", problems / "scene-0.txt.gz"
+    output = tmp_path / "solved"
+    first = problems / "scene-0.txt.gz"
     odd = problems / os.fsdecode(b'a \xe9\x85\n,".txt.gz')
     first.rename(odd)
     assert run([str(problems), "--output", str(output), *ASKED]) == 0

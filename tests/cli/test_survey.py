@@ -94,7 +94,8 @@ def write_photos(folder: Path, problem: jaxba.BundleProblem, places: np.ndarray)
 @pytest.mark.parametrize("source", ["positions", "file", "database", "photos", "projected"])
 def test_positions_on_the_earth_make_a_scene_in_metres(source, scene, tmp_path):
     _, problem, places = scene
-    names, text = problem.labels.names, {"file": "file: log.csv", "database": "database: d.db"}
+    names = problem.labels.names
+    text = {"file": "file: log.csv", "database": "database: d.db"}
     text["photos"] = "photos: images, stddev: 0.05"
     rows = ", ".join(f"{name}: {place}" for name, place in zip(names, places.tolist(), strict=True))
     inline = f"positions: {{{rows}}}, crs: EPSG:4326, stddev: 0.05"
@@ -117,10 +118,8 @@ def test_positions_on_the_earth_make_a_scene_in_metres(source, scene, tmp_path):
     np.testing.assert_allclose(
         np.asarray(rows.data[1]), np.tile(np.eye(3) / 0.05, (6, 1, 1)), atol=1e-9
     )
-    centers, before = (
-        geometry.camera_centers(found.cameras),
-        geometry.camera_centers(problem.cameras),
-    )
+    centers = geometry.camera_centers(found.cameras)
+    before = geometry.camera_centers(problem.cameras)
     np.testing.assert_allclose(
         distances(centers),
         10 * distances(before),
@@ -434,7 +433,10 @@ def test_gravity_of_colmaps_database_is_down_in_the_images(down, tmp_path):
         base.update_pose_prior(first)
     problem = jaxba.from_pycolmap(made)
     constraints = {"database": tmp_path / "d.db", "stddev": 0.02}
-    surveyed = lambda up: jaxba.survey(problem, {"gravity": {"up": up, **constraints}}).problem
+
+    def surveyed(up):
+        return jaxba.survey(problem, {"gravity": {"up": up, **constraints}}).problem
+
     found = surveyed(-np.array(down))
     (rows,) = found.residuals.rows
     assert len(rows) == problem.num_cameras - 1

@@ -111,7 +111,8 @@ def test_pixels_outside_of_their_image_are_refused_where_all_must_fit(said, faca
 
 def test_three_points_with_heights_that_go_down_turn_the_scene_over(said, facade):
     def change(survey: Survey) -> None:
-        survey.mark_names, survey.checks = survey.mark_names[:3], []
+        survey.mark_names = survey.mark_names[:3]
+        survey.checks = []
         survey.marks = survey.marks[:3] * [1, 1, -1]
         survey.mark_seen, survey.mark_pixels = survey.mark_seen[:3], survey.mark_pixels[:3]
 

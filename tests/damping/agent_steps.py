@@ -18,11 +18,14 @@ record = jax.jit(features.record, static_argnums=0)
 
 RANGE = {"low": -10.0, "high": 2.0, "first_low": -10.0, "descent": 50.0}
 FREE = AgentConfig(guard="off", **RANGE)
-REJECTED, ACCEPTED = False, True
+REJECTED = False
+ACCEPTED = True
 
 
 def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100) -> ProblemInfo:
-    count = lambda n: jnp.asarray(n, jnp.int32)
+    def count(n):
+        return jnp.asarray(n, jnp.int32)
+
     return ProblemInfo(
         cost=jnp.asarray(cost),
         observations=count(80),

@@ -50,8 +50,10 @@ def test_bold_is_a_network_that_always_asks_for_the_smallest_lambda(embedded):
 
 def test_bolds_lambda_is_the_smallest_of_all_that_the_guard_allows():
     policy = make_policy("bold")
-    config, wishes = policy.config, jnp.linspace(-1, 1, 9, dtype=jnp.float32)
-    state, damping = begin(config, info()), policy.init(info())[1]
+    config = policy.config
+    wishes = jnp.linspace(-1, 1, 9, dtype=jnp.float32)
+    state = begin(config, info())
+    damping = policy.init(info())[1]
     for accepted in (
         ACCEPTED,
         REJECTED,

@@ -98,7 +98,10 @@ def test_a_scale_free_observation_does_not_know_the_unit_of_a_pixel(unit):
 def test_the_paper_s_observation_is_the_last_errors_clipped():
     """Root mean square reprojection errors in pixels, the newest first, at most 1000."""
     config = AgentConfig(observation="paper", history=3)
-    rms = lambda cost: min(np.sqrt(2 * cost / 80), PAPER_LIMIT)
+
+    def rms(cost):
+        return min(np.sqrt(2 * cost / 80), PAPER_LIMIT)
+
     costs = [100.0, 60.0, 60.0, 20.0, 1e9]
     memory = begin(config, info(costs[0]))
     for k, cost in enumerate(costs[1:], 1):
@@ -112,11 +115,13 @@ def test_the_paper_s_observation_is_the_last_errors_clipped():
 
 def test_the_times_of_the_last_iterations_are_those_of_the_clock_newest_first():
     config = AgentConfig(observation="duration", history=3)
-    memory, seen = begin(config, info()), [0.0, 0.0, 0.0]
+    memory = begin(config, info())
+    seen = [0.0, 0.0, 0.0]
     np.testing.assert_array_equal(observe(config, memory), seen)
     for k in range(5):
         step = step_info(k != 2, candidate_cost=50.0 - k)
-        memory, seen = record(config, memory, step), [-float(duration(step)), *seen[:2]]
+        memory = record(config, memory, step)
+        seen = [-float(duration(step)), *seen[:2]]
         np.testing.assert_allclose(observe(config, memory), seen, rtol=1e-6)
     assert all(-time in np.float32(DURATIONS) for time in np.float32(seen))
     assert np.mean(DURATIONS) == pytest.approx(1, abs=1e-3)

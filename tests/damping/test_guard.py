@@ -166,14 +166,16 @@ def test_a_rescue_starts_at_the_last_lambda_that_worked_or_else_at_ceres_first(w
 def test_guarded_lambda_never_falls_after_a_rejection(patience, steps):
     config = AgentConfig(patience=patience, **RANGE)
     memory = begin(config, info())
-    last, rejected = None, False
+    last = None
+    rejected = False
     for accepted, wish in steps:
         now = decades(config, memory, wish)
         assert config.low - 1e-6 <= now <= 32 + 1e-6
         if rejected:
             assert now > last or now > 32 - 1e-6  # the bound of every lambda
         memory = after(config, memory, accepted, now)
-        last, rejected = now, not accepted
+        last = now
+        rejected = not accepted
 
 
 def test_the_agent_s_own_lambda_rises_by_so_many_decades_after_a_rejection():

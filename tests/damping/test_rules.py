@@ -25,7 +25,9 @@ from jaxba import (
 from jaxba.damping.policy import trained_step
 from jaxba.typing import InputError
 
-count = lambda n: jnp.asarray(n, jnp.int32)
+
+def count(n):
+    return jnp.asarray(n, jnp.int32)
 
 
 def info(unit: float = 1.0, dtype=jnp.float64, observations: int = 100) -> ProblemInfo:
@@ -84,12 +86,16 @@ def test_ceres_grows_by_two_four_eight_and_starts_over_after_success():
 @given(histories)
 def test_ceres_follows_its_own_minimizer(steps):
     """The trust-region strategy written down once more, radius and all."""
-    radius, factor, expected = 1e4, 2.0, [1e-4]
+    radius = 1e4
+    factor = 2.0
+    expected = [1e-4]
     for accepted, gain in steps:
         if accepted:
-            radius, factor = min(1e16, radius / max(1 / 3, 1 - (2 * gain - 1) ** 3)), 2.0
+            radius = min(1e16, radius / max(1 / 3, 1 - (2 * gain - 1) ** 3))
+            factor = 2.0
         else:
-            radius, factor = radius / factor, 2 * factor
+            radius = radius / factor
+            factor = 2 * factor
         expected.append(min(1 / radius, 1e32))
         radius = max(radius, 1e-32)
     np.testing.assert_allclose(lambdas(Ceres(), steps), expected, rtol=1e-9)
@@ -186,8 +192,11 @@ def played(policy: DampingPolicy, *steps: dict, observations: int = 100) -> list
 
 
 def test_guarded_starts_at_its_least_lambda_and_rises_half_a_decade_for_each_failure():
-    full, rejected, shortened = {}, {"accepted": False, "gain": -1.0}, {"step_fraction": 1 / 16}
-    inexact, pattern = {"forcing": 0.1, "damping_fraction": 9e-3}, {"step_fraction": 2.0}
+    full = {}
+    rejected = {"accepted": False, "gain": -1.0}
+    shortened = {"step_fraction": 1 / 16}
+    inexact = {"forcing": 0.1, "damping_fraction": 9e-3}
+    pattern = {"step_fraction": 2.0}
     found = played(make_policy("guarded"), full, rejected, full, shortened, inexact, pattern, full)
     np.testing.assert_allclose(found, [-6, -8, -7.5, -8, -7, -7, -8, -8], atol=1e-12)
     above = played(
@@ -205,8 +214,10 @@ def test_guarded_goes_to_a_smaller_lambda_where_there_are_no_pixels():
 
 
 def test_guarded_gives_way_to_ceres_rule_after_two_rejections_in_a_row_or_eight_in_all():
-    rejected, perfect = {"accepted": False, "gain": np.nan}, {"gain": 1.0}
-    third, two = np.log10(1 / 3), np.log10(2)
+    rejected = {"accepted": False, "gain": np.nan}
+    perfect = {"gain": 1.0}
+    third = np.log10(1 / 3)
+    two = np.log10(2)
     found = played(make_policy("guarded"), rejected, rejected, perfect, rejected, rejected, perfect)
     # begins again where the last accepted step was, if no larger one failed
     ceres = -4 + np.cumsum([0, third, two])

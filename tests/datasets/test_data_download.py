@@ -61,7 +61,8 @@ class _Handler(BaseHTTPRequestHandler):
     server: Server  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
-        server, span = self.server, self.headers.get("Range")
+        server = self.server
+        span = self.headers.get("Range")
         server.asked.append((self.path, span))
         body = server.files.get(self.path)
         if body is None:
@@ -120,7 +121,9 @@ def break_off(server: Server, folder: Path, after: int, entry: Entry = ENTRY) ->
     server.break_after = after
     with pytest.raises(DownloadError, match="the connection broke after"):
         get(server, folder, entry)
-    server.break_after, server.sent, server.asked = None, 0, []
+    server.break_after = None
+    server.sent = 0
+    server.asked = []
 
 
 def check_one_line(error: str, message: str) -> None:
@@ -172,7 +175,9 @@ def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(
 ):
     """The first one holds its file until the second one has come to the lock."""
     fcntl = pytest.importorskip("fcntl")
-    waits, results, lock = threading.Event(), [], fcntl.flock
+    waits = threading.Event()
+    results = []
+    lock = fcntl.flock
 
     def flock(*arguments) -> None:
         if threading.current_thread() is second:

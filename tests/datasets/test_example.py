@@ -17,7 +17,8 @@ SCENE = jaxba.SceneConfig(
 
 
 def test_the_example_is_a_random_scene_rounded():
-    found, scene = jaxba.example_problem(), jaxba.random_scene(SCENE, seed=0)
+    found = jaxba.example_problem()
+    scene = jaxba.random_scene(SCENE, seed=0)
     np.testing.assert_allclose(found.observations, scene.observations, atol=0.0051)
     np.testing.assert_allclose(found.cameras, scene.cameras, atol=1e-7)
     np.testing.assert_allclose(found.points, scene.points, atol=1e-5)

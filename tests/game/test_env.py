@@ -96,7 +96,8 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
         np.testing.assert_array_equal(step.terminated, success | at_limit)
         assert not step.truncated.any()
         np.testing.assert_array_equal(step.metrics["length"], episodes.memory.iteration + 1)
-        goals, limits = goals + success.sum(), limits + (at_limit & ~success).sum()
+        goals = goals + success.sum()
+        limits = limits + (at_limit & ~success).sum()
     assert goals >= 5
     assert limits >= 5
 
@@ -213,7 +214,8 @@ def test_the_game_pays_what_it_says():
     checked = 0
     for k in range(len(found) - 1):
         before, _, _, step = found[k]
-        episodes, following = before.episodes, found[k + 1][0].episodes
+        episodes = before.episodes
+        following = found[k + 1][0].episodes
         for e in range(ENVS):
             success = bool(step.metrics["success"][e])
             best = float(np.asarray(tiny_bank().best_cost)[episodes.scene[e]])

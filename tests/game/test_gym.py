@@ -137,7 +137,9 @@ def test_a_seed_decides_everything_and_no_seed_goes_on(envs):
         rows += [envs.step(action)[0] for action in actions]
         return np.stack(rows)
 
-    first, other, again = play(5), play(6), play(5)
+    first = play(5)
+    other = play(6)
+    again = play(5)
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
     assert not np.array_equal(play(None), again)

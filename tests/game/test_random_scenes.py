@@ -39,7 +39,8 @@ def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
     ).all()
     assert not mask.reshape(40, kind.cameras, -1)[:, :, -1].any()  # the empty point
     seen = grid(kind, scenes)
-    views, observed = seen.sum(axis=1), seen.sum(axis=2)
+    views = seen.sum(axis=1)
+    observed = seen.sum(axis=2)
     assert (views[views > 0] >= 2).all()
     assert (observed[observed > 0] >= MIN_VIEWS).all()
     if kind.family == "paper":
@@ -73,7 +74,8 @@ def test_the_cost_of_a_start_is_what_numpy_says(kind):
 def test_the_paper_s_cameras_stand_at_random_around_its_points():
     """In all directions, before all points, with focal length 500."""
     scenes = make_scenes(SceneClass(6, 10, "paper"), jax.random.key(3), 40)
-    cameras, points = np.asarray(scenes.cameras), np.asarray(scenes.points)[:, :, :-1]
+    cameras = np.asarray(scenes.cameras)
+    points = np.asarray(scenes.points)[:, :, :-1]
     centers = np.stack([geometry.camera_centers(c.T) for c in cameras]).reshape(-1, 3)
     distance = np.linalg.norm(centers, axis=1)
     assert 8.5 < distance.mean() < 11  # 9 and its error

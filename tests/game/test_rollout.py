@@ -56,7 +56,8 @@ def test_the_bank_is_large_enough_to_test_with():
 
 @pytest.mark.slow
 def test_a_scene_is_played_as_it_is_solved():
-    bank, found = tiny_bank(), played()
+    bank = tiny_bank()
+    found = played()
     for k in (0, 5):
         alone = solve(problem_of(KIND, bank.scenes, k), "ceres", max_iterations=LIMIT)
         count = min(5, alone.iterations)
@@ -71,7 +72,8 @@ def test_a_scene_is_played_as_it_is_solved():
 
 @pytest.mark.slow
 def test_a_scene_is_played_as_it_is_solved_by_a_method():
-    bank, options = tiny_bank(), make_method("deeplm").options(StepOptions())
+    bank = tiny_bank()
+    options = make_method("deeplm").options(StepOptions())
     found = play(KIND, bank, CERES, options, 6)
     for k in (0, 5):
         alone = solve(problem_of(KIND, bank.scenes, k), "ceres", options, max_iterations=6)
@@ -83,9 +85,15 @@ def test_a_scene_is_played_as_it_is_solved_by_a_method():
 
 @pytest.mark.parametrize("count", [3, GROUP + 1])
 def test_agents_that_play_side_by_side_step_in_groups_as_each_alone(count):
-    shared, scenes = jnp.asarray([2.0, 3.0]), jnp.arange(3.0 * count).reshape(3, count)
-    one = lambda shared, x, y: (shared @ jnp.stack([x, y]), x > 1)
-    step = lambda x, y: step_groups(one, x, y, shared=shared)
+    shared = jnp.asarray([2.0, 3.0])
+    scenes = jnp.arange(3.0 * count).reshape(3, count)
+
+    def one(shared, x, y):
+        return (shared @ jnp.stack([x, y]), x > 1)
+
+    def step(x, y):
+        return step_groups(one, x, y, shared=shared)
+
     found = jax.jit(jax.vmap(step, (0, None)))(scenes, scenes[0])
     for agent in range(3):
         chex.assert_trees_all_equal(
@@ -97,10 +105,8 @@ def test_agents_that_play_side_by_side_step_in_groups_as_each_alone(count):
 @pytest.mark.slow
 def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
     """As no preset has them."""
-    kind, options = (
-        SceneClass(MOST_CAMERAS, MOST_POINTS),
-        StepOptions(refinement=Refinement(points=3)),
-    )
+    kind = SceneClass(MOST_CAMERAS, MOST_POINTS)
+    options = StepOptions(refinement=Refinement(points=3))
     scenes = make_scenes(kind, jax.random.key(5), 4)
     costs = initial_costs(kind, scenes)
     found = play(
@@ -118,7 +124,8 @@ def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
 
 @pytest.mark.slow
 def test_scenes_of_a_class_share_random_clusters():
-    bank, options = tiny_bank(), make_method("stba:2").options(StepOptions())
+    bank = tiny_bank()
+    options = make_method("stba:2").options(StepOptions())
     labels = class_layout(KIND, options).partitions.label
     assert labels.max() >= 1
     assert len(np.unique(labels, axis=0)) > 1
@@ -132,7 +139,8 @@ def test_scenes_of_a_class_share_random_clusters():
 def test_scenes_whose_steps_have_trials_and_rounds_are_played_as_each_alone():
     """Candidates and camera rounds, vectorised over scenes: the same as one scene after the
     other."""
-    bank, damping = tiny_bank(), 1e-6
+    bank = tiny_bank()
+    damping = 1e-6
     options = StepOptions(
         refinement=Refinement(points=2, trials=3, camera_rounds=2, pattern_moves=2)
     )
@@ -153,7 +161,8 @@ def test_scenes_whose_steps_have_trials_and_rounds_are_played_as_each_alone():
 
 
 def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
-    bank, found = tiny_bank(), played()
+    bank = tiny_bank()
+    found = played()
     assert found.costs.shape == (len(bank.initial_cost), LIMIT + 1)
     np.testing.assert_array_equal(found.costs[:, 0], bank.initial_cost)
     assert (np.diff(found.costs, axis=1) <= 0).all()
@@ -194,7 +203,10 @@ def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
     options = make_method(method).options(StepOptions())
     rng = np.random.default_rng(2)
     size = observation_size(AGENT)
-    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)
+
+    def draw(*shape):
+        return rng.normal(size=shape).astype(np.float32)
+
     policy = LearnedPolicy((Layer(draw(size, 8), draw(8)), Layer(draw(8, 2), draw(2))), AGENT)
     bank = tiny_bank()
     found = play(KIND, bank, policy, options, LIMIT)
@@ -264,7 +276,8 @@ def test_the_best_constant_action_has_the_fewest_iterations():
 
 
 def test_policies_that_share_a_program_play_as_they_do_alone():
-    bank, names = tiny_bank(), ("ceres", "constant:1e-3", "gtsam", "constant:1e-5")
+    bank = tiny_bank()
+    names = ("ceres", "constant:1e-3", "gtsam", "constant:1e-5")
     alone = {name: play(KIND, bank, make_policy(name), StepOptions(), LIMIT) for name in names[:2]}
     steps = alike({name: (make_policy(name), StepOptions()) for name in names})
     assert len({jax.tree.structure(policy) for policy, _ in steps.values()}) == 1

@@ -49,7 +49,8 @@ def test_cameras_of_training_and_held_out_windows_are_disjoint_and_all():
 def test_a_window_holds_what_the_problem_holds(file):
     """Cameras, points and pixels are the problem's and belong together; of about half of them the
     starts, too."""
-    problem, unmoved = street(), 0
+    problem = street()
+    unmoved = 0
     train, held_out = read_windows([file], KIND, 20, seed=0)
     assert (len(train.mask), len(held_out.mask)) == (16, 4)
     view_of = {tuple(x): k for k, x in enumerate(problem.observations.tolist())}
@@ -93,7 +94,8 @@ def test_held_out_windows_have_other_cameras(file):
 
 
 def test_the_same_seed_gives_the_same_window():
-    linked, allowed = covisible(street()), np.arange(20)
+    linked = covisible(street())
+    allowed = np.arange(20)
     one, same, other = (
         window(street(), KIND, linked, allowed, np.random.default_rng(seed)) for seed in (0, 0, 1)
     )

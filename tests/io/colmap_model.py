@@ -84,7 +84,8 @@ class TextModel:
     def write_binary(self, folder: Path) -> Path:
         """Writes binary files of the same content, without rigs and frames."""
         folder.mkdir(parents=True, exist_ok=True)
-        images, points = [], []
+        images = []
+        points = []
         for head, keys in zip(self.heads, self.keys, strict=True):
             identity, *pose, camera, name = head.split(None, 9)
             seen = [

@@ -32,7 +32,8 @@ class Lens:
         if self.fisheye:
             t = np.arctan(r)
             s = (t + sum(k * t ** (2 * i + 3) for i, k in enumerate(self.radial))) / r
-            x, y = s * x, s * y
+            x = s * x
+            y = s * y
         else:
             d = 1 + sum(k * r ** (2 * i + 2) for i, k in enumerate(self.radial))
             p1, p2 = self.tangential
@@ -99,10 +100,8 @@ def write_opensfm(folder: Path, scene: Scene, models: list[str], version: int = 
         cameras[f"v2 maker {at}"] = camera
     shots = {}
     for i, rotation in enumerate(scene.rotations):
-        turn, shift = (
-            Rotation.from_matrix(rotation).as_rotvec().tolist(),
-            (-rotation @ scene.centers[i]).tolist(),
-        )
+        turn = Rotation.from_matrix(rotation).as_rotvec().tolist()
+        shift = (-rotation @ scene.centers[i]).tolist()
         shots[f"a shot {i}.jpg"] = {
             "camera": f"v2 maker {scene.lens_of[i]}",
             "rotation": turn,

@@ -65,7 +65,8 @@ def test_cameras_say_what_a_lens_has_and_which_images_share_it(tmp_path):
     write_problem(shared, f"{tmp_path}/new/")
     data = (tmp_path / "new" / "cameras.bin").read_bytes()
     kinds = {0: ("SIMPLE_PINHOLE", 3), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5)}
-    at, found = 8, []
+    at = 8
+    found = []
     for _ in range(4):
         _, kind, width, height = struct.unpack_from("<IiQQ", data, at)
         name, count = kinds[kind]

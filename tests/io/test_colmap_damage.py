@@ -136,7 +136,8 @@ def test_a_view_that_is_said_twice_counts_once(tmp_path, healthy):
 
 def test_key_points_say_which_views_there_are(tmp_path, healthy):
     model = TextModel()
-    image, key = int(model.points[0][8]), int(model.points[0][9])
+    image = int(model.points[0][8])
+    key = int(model.points[0][9])
     model.keys[image - 1][key][2] = "-1"  # the track of point 11 goes on to name it
     del model.points[1][-2:]  # its key-point goes on to name point 12
     problem, notes = noted(model.write(tmp_path / "m"))
@@ -304,7 +305,10 @@ def test_whole_numbers_may_be_written_with_a_point(tmp_path, healthy):
 
 def test_ids_of_points_are_exact_up_to_the_largest(tmp_path, healthy):
     model = TextModel()
-    large = lambda identity: str(2**64 - 60 + int(identity))
+
+    def large(identity):
+        return str(2**64 - 60 + int(identity))
+
     model.keys = [[[x, y, large(point)] for x, y, point in keys] for keys in model.keys]
     model.points = [[large(point[0]), *point[1:]] for point in model.points]
     problem, notes = noted(model.write(tmp_path / "m"))

@@ -26,20 +26,19 @@ def scene(
 ):
     """A scene with noise, in which some key-points see no point."""
     pycolmap.set_random_seed(2)
-    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
-        rigs,
-        cameras,
-        frames,
-    )
-    options.num_points3D, options.num_points2D_without_point3D = points, 7
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.__members__[model], lens
+    options = pycolmap.SyntheticDatasetOptions()
+    noise = pycolmap.SyntheticNoiseOptions()
+    options.num_rigs = rigs
+    options.num_cameras_per_rig = cameras
+    options.num_frames_per_rig = frames
+    options.num_points3D = points
+    options.num_points2D_without_point3D = 7
+    options.camera_model_id = pycolmap.CameraModelId.__members__[model]
+    options.camera_params = lens
     reconstruction = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
-        0.5,
-        0.02,
-        0.3,
-    )
+    noise.point2D_stddev = 0.5
+    noise.point3D_stddev = 0.02
+    noise.rig_from_world_rotation_stddev = 0.3
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, reconstruction)
     return reconstruction
@@ -58,7 +57,8 @@ def with_two_models(reconstruction):
     """The scene with a camera of another model."""
     camera = reconstruction.camera(2)
     focal, x, y, _ = camera.params
-    camera.model, camera.params = pycolmap.CameraModelId.PINHOLE, [focal, focal, x, y]
+    camera.model = pycolmap.CameraModelId.PINHOLE
+    camera.params = [focal, focal, x, y]
     return reconstruction
 
 
@@ -96,7 +96,8 @@ def from_files(reconstruction, folder):
 def chosen(reconstruction):
     """A config of some images, variable and constant points, and a constant frame and lens."""
     config = pycolmap.BundleAdjustmentConfig()
-    images, points = sorted(reconstruction.reg_image_ids()), sorted(reconstruction.points3D)
+    images = sorted(reconstruction.reg_image_ids())
+    points = sorted(reconstruction.points3D)
     for image in images[: len(images) // 2]:
         config.add_image(image)
     for point in points[:8]:
@@ -141,7 +142,8 @@ def assert_same(problem, expected):
     if expected.constants is not None:
         np.testing.assert_array_equal(problem.constants.poses, expected.constants.poses)
         np.testing.assert_array_equal(problem.constants.points, expected.constants.points)
-    ours, theirs = every_lens(problem), every_lens(expected)
+    ours = every_lens(problem)
+    theirs = every_lens(expected)
     np.testing.assert_array_equal(ours.free[ours.index], theirs.free[theirs.index])
     for at in range(problem.num_cameras):
         assert (
@@ -182,7 +184,8 @@ def test_the_problem_of_a_config_is_the_part_of_the_files_that_it_means(reconstr
 
 def test_points_of_short_tracks_do_not_count(tmp_path):
     reconstruction = with_short_tracks(scene())
-    options, config = pycolmap.BundleAdjustmentOptions(), chosen(reconstruction)
+    options = pycolmap.BundleAdjustmentOptions()
+    config = chosen(reconstruction)
     options.min_track_length = least = 4
     lengths = {number: point.track.length() for number, point in reconstruction.points3D.items()}
     assert min(lengths.values()) < least
@@ -237,7 +240,8 @@ def test_all_is_updated_as_files_are(kind, tmp_path):
 def test_a_part_is_updated_as_files_are_and_the_rest_stays(kind, tmp_path):
     reconstruction = SCENES[kind]()
     reconstruction.update_point_3d_errors()
-    config, options = chosen(reconstruction), jaxba.SolveOptions(max_iterations=2)
+    config = chosen(reconstruction)
+    options = jaxba.SolveOptions(max_iterations=2)
     expected, *_ = chosen_of_whole(
         from_files(reconstruction, tmp_path / "old"), config, reconstruction
     )
@@ -247,7 +251,8 @@ def test_a_part_is_updated_as_files_are_and_the_rest_stays(kind, tmp_path):
     before = numbers(reconstruction)
     solution = jaxba.solve(jaxba.from_pycolmap(reconstruction, config), options=options)
     solution.update(reconstruction)
-    after, of_files = numbers(reconstruction), numbers(pycolmap.Reconstruction(tmp_path / "new"))
+    after = numbers(reconstruction)
+    of_files = numbers(pycolmap.Reconstruction(tmp_path / "new"))
     views = np.bincount(solution.problem.point_index).tolist()
     points = solution.problem.labels.points.tolist()
     seen_whole = {

@@ -23,14 +23,18 @@ def test_rejected_observations_leave_tracks_and_key_points_and_points_of_one_vie
     write_colmap(problem, tmp_path / "new", like=tmp_path / "old", rejected=rejected)
     old, new = (pycolmap.Reconstruction(str(tmp_path / name)) for name in ("old", "new"))
     assert problem.labels is not None
-    ids, kept = np.array(problem.labels.points), ~rejected
+    ids = np.array(problem.labels.points)
+    kept = ~rejected
     views = np.bincount(problem.point_index[kept], minlength=problem.num_points)
     assert sorted(new.points3D) == ids[views > 1].tolist()
     assert 0 < len(new.points3D) < len(old.points3D)
-    pairs = lambda image: {
-        (tuple(key.xy), key.point3D_id) for key in image.points2D if key.has_point3D()
-    }
-    shift = lambda number: np.array(old.cameras[old.images[number].camera_id].params[1:3])
+
+    def pairs(image):
+        return {(tuple(key.xy), key.point3D_id) for key in image.points2D if key.has_point3D()}
+
+    def shift(number):
+        return np.array(old.cameras[old.images[number].camera_id].params[1:3])
+
     for at, number in enumerate(problem.labels.images.tolist()):
         mine = np.flatnonzero(
             kept & (problem.camera_index == at) & (views > 1)[problem.point_index]

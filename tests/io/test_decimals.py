@@ -79,7 +79,8 @@ def test_words_halfway_between_two_numbers_are_rounded_to_even():
     words = []
     for (over, under), (step_over, step_under) in zip(halves, steps, strict=True):
         # the value and half a step
-        top, bottom = 2 * over * step_under + under * step_over, 2 * under * step_under
+        top = 2 * over * step_under + under * step_over
+        bottom = 2 * under * step_under
         shift = max(bottom.bit_length() - 1, 0)  # a power of two: exact with so many decimal digits
         digits = str(top * 5**shift * 2**shift // bottom).rjust(shift + 1, "0")
         words.append(f"{digits[: len(digits) - shift]}.{digits[len(digits) - shift :]}")
@@ -90,7 +91,10 @@ def test_words_halfway_between_two_numbers_are_rounded_to_even():
 def test_written_numbers_read_back_bit_by_bit_in_the_fewest_digits(values):
     lines = number_lines(np.array(values)).decode().split()
     assert np.array(list(map(float, lines))).tobytes() == np.array(values).tobytes()
-    count = lambda word: len(word.lstrip("-").partition("e")[0].replace(".", "").strip("0"))
+
+    def count(word):
+        return len(word.lstrip("-").partition("e")[0].replace(".", "").strip("0"))
+
     assert list(map(count, lines)) == [count(repr(value)) for value in values]
 
 

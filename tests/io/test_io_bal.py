@@ -69,7 +69,8 @@ def random_problem(
 
 def assert_same_bits(one: BundleProblem, other: BundleProblem) -> None:
     for name in ("cameras", "points", "observations", "camera_index", "point_index"):
-        a, b = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
+        a = np.asarray(getattr(one, name))
+        b = np.asarray(getattr(other, name))
         assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), name
 
 
@@ -304,7 +305,8 @@ def test_a_number_of_many_digits_is_rounded_correctly(tmp_path):
 
 @pytest.mark.parametrize("suffix", SUFFIXES[1:])
 def test_damaged_compressed_files_are_refused(tmp_path, suffix):
-    good, bad = tmp_path / f"good.txt{suffix}", tmp_path / f"bad.txt{suffix}"
+    good = tmp_path / f"good.txt{suffix}"
+    bad = tmp_path / f"bad.txt{suffix}"
     write_bal(random_problem(0), good)
     whole = good.read_bytes()
     half = len(whole) // 2
@@ -502,11 +504,13 @@ def test_real_problem_round_trips(tmp_path):
 def _cost(problem: BundleProblem) -> np.ndarray:
     """The cost by a rotation matrix per camera from the matrix exponential's series: independent of
     the package."""
-    cameras, points = np.asarray(problem.cameras), np.asarray(problem.points)
+    cameras = np.asarray(problem.cameras)
+    points = np.asarray(problem.points)
     x, y, z = cameras[:, :3].T / 1024
     zero = np.zeros_like(x)
     skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    rotation, term = np.tile(np.eye(3), (len(cameras), 1, 1)), np.eye(3)
+    rotation = np.tile(np.eye(3), (len(cameras), 1, 1))
+    term = np.eye(3)
     for order in range(1, 12):
         term = term @ skew / order
         rotation = rotation + term

@@ -74,7 +74,8 @@ def model_of(kinds: list[str], seed: int = 0):
     ids = [40 - 3 * camera for camera in range(scene.num_cameras)]
     for camera, identity in enumerate(ids):
         lens_id = 9 - 3 * (camera % len(kinds))
-        rotation, shift = flip @ matrices[camera], flip @ scene.cameras[camera, 3:6]
+        rotation = flip @ matrices[camera]
+        shift = flip @ scene.cameras[camera, 3:6]
         keys = model.camera(lens_id).img_from_cam(scene.points @ rotation.T + shift)
         keys = np.vstack([[[1.0, 2.0]], keys + rng.normal(scale=0.5, size=keys.shape)])
         image = pycolmap.Image(
@@ -434,10 +435,8 @@ def test_what_could_not_be_read_is_not_written(tmp_path, change):
 
 
 def test_a_text_model_beside_a_binary_one_is_written_as_that(tmp_path):
-    text, binary = (
-        write(model_of(["RADIAL"]), tmp_path / "text", text=True),
-        write(model_of(["RADIAL"]), tmp_path / "b"),
-    )
+    text = write(model_of(["RADIAL"]), tmp_path / "text", text=True)
+    binary = write(model_of(["RADIAL"]), tmp_path / "b")
     problem = read_problem(text)
     moved = problem.replace(points=problem.points + 1)
     write_colmap(moved, binary, like=text)
@@ -459,15 +458,17 @@ def test_both_forms_of_a_folder_are_written_and_none_is_left_old(tmp_path):
 def rigs_of(cameras: int):
     """Two rigs of cameras that see 60 points in five frames each, with noise."""
     pycolmap.set_random_seed(0)
-    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, cameras, 5
-    options.num_points3D, options.num_points2D_without_point3D = 60, 0
+    options = pycolmap.SyntheticDatasetOptions()
+    noise = pycolmap.SyntheticNoiseOptions()
+    options.num_rigs = 2
+    options.num_cameras_per_rig = cameras
+    options.num_frames_per_rig = 5
+    options.num_points3D = 60
+    options.num_points2D_without_point3D = 0
     model = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
-        0.5,
-        0.02,
-        0.3,
-    )
+    noise.point2D_stddev = 0.5
+    noise.point3D_stddev = 0.02
+    noise.rig_from_world_rotation_stddev = 0.3
     pycolmap.synthesize_noise(noise, model)
     return model
 
@@ -621,10 +622,8 @@ def test_covariances_are_colmaps(tmp_path):
     points = [0, 20, 40]
     found = covariance(hold(problem, points=points))
     model = pycolmap.Reconstruction(str(tmp_path / "solved"))
-    options, config = (
-        pycolmap.BundleAdjustmentOptions(print_summary=False),
-        pycolmap.BundleAdjustmentConfig(),
-    )
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    config = pycolmap.BundleAdjustmentConfig()
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     for identity in model.reg_image_ids():
         config.add_image(identity)

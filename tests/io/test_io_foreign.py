@@ -184,7 +184,8 @@ def test_what_a_file_holds_and_nothing_uses_is_one_note_and_refused_if_strict(tm
 def test_compressed_marked_and_windows_files_are_read_too(tmp_path):
     scene = scene_of(PINHOLE)
     path = write_opensfm(tmp_path, scene, ["perspective"])
-    text, tracks = path.read_text(), (tmp_path / "tracks.csv").read_bytes()
+    text = path.read_text()
+    tracks = (tmp_path / "tracks.csv").read_bytes()
     (tmp_path / "tracks.csv").unlink()
     (tmp_path / "tracks.csv.gz").write_bytes(
         gzip.compress(b"\xef\xbb\xbf" + tracks.replace(b"\n", b"\r\n"))

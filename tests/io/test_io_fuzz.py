@@ -118,7 +118,8 @@ def check(path: Path, content: bytes) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ProblemWarning)
-        complaint, problem = None, None
+        complaint = None
+        problem = None
         try:
             problem = read_problem(path)
         except ProblemError as error:
@@ -183,14 +184,14 @@ def mutated(draw: st.DrawFn, value: object) -> object:
     depth."""
     value = json.loads(json.dumps(value))
     for _ in range(draw(st.integers(1, 3))):
-        above, key, here = None, None, value
+        above = None
+        key = None
+        here = value
         for _ in range(draw(st.integers(1, 9))):
             if not (isinstance(here, (dict, list)) and here):
                 break
-            above, key = (
-                here,
-                draw(st.sampled_from(list(here) if isinstance(here, dict) else range(len(here)))),
-            )
+            above = here
+            key = draw(st.sampled_from(list(here) if isinstance(here, dict) else range(len(here))))
             here = above[key]
         if above is None:
             continue
@@ -213,7 +214,8 @@ def check_foreign(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ProblemWarning)
-        complaint, problem = None, None
+        complaint = None
+        problem = None
         try:
             problem = read_problem(path)
         except ProblemError as error:

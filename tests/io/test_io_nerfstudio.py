@@ -37,7 +37,8 @@ def pixels_of(document: dict, points: np.ndarray) -> dict[str, np.ndarray]:
         )
         matrix = np.array([[lens["fl_x"], 0, lens["cx"]], [0, lens["fl_y"], lens["cy"]], [0, 0, 1]])
         # OpenCV's camera looks along z, with y down
-        ahead, none = local[:3].T * [1, -1, -1], np.zeros(3)
+        ahead = local[:3].T * [1, -1, -1]
+        none = np.zeros(3)
         if document["camera_model"] == "OPENCV_FISHEYE":
             radial = np.array([lens.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)])
             pixels, _ = cv2.fisheye.projectPoints(ahead[None], none, none, matrix, radial)
@@ -55,7 +56,8 @@ def check(file: Path, problem: jaxba.BundleProblem) -> dict:
     document = json.loads(file.read_text())
     found = pixels_of(document, np.asarray(problem.points))
     assert list(found) == [f"images/{name}" for name in problem.labels.names]
-    expected, at = geometry.project(problem), np.asarray(problem.camera_index)
+    expected = geometry.project(problem)
+    at = np.asarray(problem.camera_index)
     pixels = np.stack(list(found.values()))[at, np.asarray(problem.point_index)]
     np.testing.assert_allclose(pixels, expected, atol=1e-8)
     return document
@@ -94,7 +96,8 @@ def test_a_problem_without_names_gets_those_that_a_new_model_would(tmp_path):
 
 
 def test_the_command_writes_the_cameras_of_a_model(tmp_path, capsys):
-    folder, file = TextModel().write(tmp_path / "model"), tmp_path / "transforms.json"
+    folder = TextModel().write(tmp_path / "model")
+    file = tmp_path / "transforms.json"
     arguments = [str(folder), "--max-iterations", "2", "--output"]
     assert run([*arguments, str(file)]) == 0
     assert "note" not in capsys.readouterr().out

@@ -22,8 +22,10 @@ PLACES = np.array([[8.5, 47.3, 500.0], [8.51, 47.31, 620.0], [8.52, 47.29, 480.0
 
 def geocentric(places: np.ndarray) -> np.ndarray:
     """The textbook's formula for WGS 84."""
-    (lon, lat), h = np.radians(places[:, :2]).T, places[:, 2]
-    a, f = 6378137.0, 1 / 298.257223563
+    (lon, lat) = np.radians(places[:, :2]).T
+    h = places[:, 2]
+    a = 6378137.0
+    f = 1 / 298.257223563
     e2 = f * (2 - f)
     n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
     return np.stack(

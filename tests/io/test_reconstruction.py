@@ -19,19 +19,16 @@ pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore::jaxba.Probl
 
 def scene(rigs=10, cameras=1, frames=1):
     pycolmap.set_random_seed(3)
-    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = (
-        rigs,
-        cameras,
-        frames,
-    )
+    options = pycolmap.SyntheticDatasetOptions()
+    noise = pycolmap.SyntheticNoiseOptions()
+    options.num_rigs = rigs
+    options.num_cameras_per_rig = cameras
+    options.num_frames_per_rig = frames
     options.num_points3D = 100
     found = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
-        0.5,
-        0.02,
-        0.3,
-    )
+    noise.point2D_stddev = 0.5
+    noise.point3D_stddev = 0.02
+    noise.rig_from_world_rotation_stddev = 0.3
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, found)
     return found
@@ -40,12 +37,11 @@ def scene(rigs=10, cameras=1, frames=1):
 def tight(**changes):
     options = pycolmap.BundleAdjustmentOptions()
     ceres = options.ceres.solver_options
-    ceres.function_tolerance, ceres.gradient_tolerance, ceres.parameter_tolerance = (
-        1e-14,
-        1e-12,
-        1e-14,
-    )
-    ceres.max_num_iterations, options.print_summary = 300, False
+    ceres.function_tolerance = 1e-14
+    ceres.gradient_tolerance = 1e-12
+    ceres.parameter_tolerance = 1e-14
+    ceres.max_num_iterations = 300
+    options.print_summary = False
     for name, value in changes.items():
         setattr(options, name, value)
     return options
@@ -79,7 +75,8 @@ def test_a_script_changed_in_one_line_ends_alike(shape):
 @pytest.mark.parametrize("refined", ["refine_focal_length", "refine_extra_params"])
 def test_what_options_hold_stays(refined):
     theirs = scene()
-    ours, options = copy.deepcopy(theirs), tight(**{refined: False})
+    ours = copy.deepcopy(theirs)
+    options = tight(**{refined: False})
     pycolmap.bundle_adjustment(theirs, options)
     jaxba.bundle_adjustment(ours, options)
     assert cost(ours) == pytest.approx(cost(theirs), rel=1e-8)
@@ -90,8 +87,11 @@ def test_what_options_hold_stays(refined):
 )
 def test_local_bundle_adjustment_ends_as_colmaps_does(kind):
     theirs = scene()
-    ours, options, config = copy.deepcopy(theirs), tight(), pycolmap.BundleAdjustmentConfig()
-    images, points = sorted(theirs.images)[:6], sorted(theirs.points3D)
+    ours = copy.deepcopy(theirs)
+    options = tight()
+    config = pycolmap.BundleAdjustmentConfig()
+    images = sorted(theirs.images)[:6]
+    points = sorted(theirs.points3D)
     for image in images:
         config.add_image(image)
     if kind != "images":
@@ -103,10 +103,8 @@ def test_local_bundle_adjustment_ends_as_colmaps_does(kind):
         config.set_constant_rig_from_world_pose(theirs.images[images[0]].frame_id)
         config.set_constant_cam_intrinsics(theirs.images[images[1]].camera_id)
     if kind == "robust":
-        options.ceres.loss_function_type, options.ceres.loss_function_scale = (
-            pycolmap.LossFunctionType.CAUCHY,
-            2.0,
-        )
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = 2.0
     if kind == "short tracks":
         options.min_track_length = 10
         theirs.delete_observation(images[0], 0)
@@ -116,7 +114,8 @@ def test_local_bundle_adjustment_ends_as_colmaps_does(kind):
     assert solution.converged
     assert cost(ours) == pytest.approx(cost(theirs), rel=1e-8)
     for image in theirs.images.values():
-        ours_at, theirs_at = ours.images[image.image_id].cam_from_world(), image.cam_from_world()
+        ours_at = ours.images[image.image_id].cam_from_world()
+        theirs_at = image.cam_from_world()
         np.testing.assert_allclose(ours_at.matrix(), theirs_at.matrix(), atol=1e-5)
 
 
@@ -139,7 +138,8 @@ def test_a_part_can_be_written_into_the_whole_model(tmp_path):
 
 
 def test_what_cannot_be_is_one_line_without_a_temporary_name():
-    model, config = scene(3), pycolmap.BundleAdjustmentConfig()
+    model = scene(3)
+    config = pycolmap.BundleAdjustmentConfig()
     with pytest.raises(ValueError, match=r"must be a pycolmap\.Reconstruction, not 'sparse/0'"):
         jaxba.from_pycolmap("sparse/0")
     with pytest.raises(jaxba.ProblemError, match=r"^the reconstruction: no image sees a point$"):

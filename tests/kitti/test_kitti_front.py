@@ -97,7 +97,8 @@ def brute_force(a: np.ndarray, b: np.ndarray, ratio: float) -> set[tuple[int, in
         j = int(distance[i].argmin())
         if distance[:, j].argmin() != i:
             continue
-        row, column = np.sort(distance[i]), np.sort(distance[:, j])
+        row = np.sort(distance[i])
+        column = np.sort(distance[:, j])
         if distance[i, j] < ratio * row[1] and distance[i, j] < ratio * column[1]:
             found.add((i, j))
     return found
@@ -131,7 +132,8 @@ def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera)
     printed = capsys.readouterr()
     assert printed.err == ""
     assert start_error(printed.out) < 0.05
-    problem, side = read_bal(out), json.loads((tmp_path / "problem.frames.json").read_text())
+    problem = read_bal(out)
+    side = json.loads((tmp_path / "problem.frames.json").read_text())
     assert problem.num_cameras == len(side["frames"])
     assert side["calibration"]["fx"] == camera.fx
     assert side["options"]["keyframes"] == "auto"
@@ -144,10 +146,13 @@ def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera)
 @pytest.mark.slow
 def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     """jaxba-kitti, jaxba-solve and jaxba-kitti evaluate, one after the other."""
-    out, solved, folder = tmp_path / "p.txt", tmp_path / "solved.txt.gz", tmp_path / "eval"
+    out = tmp_path / "p.txt"
+    solved = tmp_path / "solved.txt.gz"
+    folder = tmp_path / "eval"
     poses = rendered[OTHER] / "poses.txt"
     assert build(rendered[OTHER], out, "--start", "poses", "--keyframes", "all") == 0
-    exact, noise = read_bal(out), np.random.default_rng(0).normal(size=(FRAMES, 3))
+    exact = read_bal(out)
+    noise = np.random.default_rng(0).normal(size=(FRAMES, 3))
     cameras = np.array(exact.cameras)
     cameras[:, 3:6] += 0.1 * np.cumsum(noise, axis=0)
     write_problem(exact.replace(cameras=cameras), out)
@@ -232,7 +237,8 @@ def test_a_car_that_stands_first_is_no_trouble(sequence, tmp_path, capsys, choic
 
 @pytest.mark.parametrize("choice", ["auto", "all"])
 def test_a_camera_that_only_turns_is_refused(sequence, tmp_path, capsys, choice):
-    layers, poses = textures(), kitti_scene.path(FRAMES)
+    layers = textures()
+    poses = kitti_scene.path(FRAMES)
     for number in range(6):
         pose = poses[number].copy()
         pose[:, 3] = poses[0, :, 3]
@@ -329,7 +335,8 @@ def test_what_makes_no_sense_is_said_in_one_line(
 
 
 def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, capsys):
-    out, other = tmp_path / "p.txt", tmp_path / "q.txt"
+    out = tmp_path / "p.txt"
+    other = tmp_path / "q.txt"
     assert build(rendered[SMALL], out) == 0
     assert build(rendered[SMALL], other, "--keyframes", "all") == 0
     short = tmp_path / "short.txt"
@@ -353,10 +360,12 @@ def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, caps
 
 def test_an_error_that_is_not_finite_is_said_in_one_line(rendered, tmp_path, capsys):
     """A point in the plane of a camera that sees it has no projection."""
-    out, bad = tmp_path / "p.txt", tmp_path / "bad.txt"
+    out = tmp_path / "p.txt"
+    bad = tmp_path / "bad.txt"
     assert build(rendered[SMALL], out) == 0
     problem = read_bal(out)
-    cameras, points = np.array(problem.cameras), np.array(problem.points)
+    cameras = np.array(problem.cameras)
+    points = np.array(problem.points)
     cameras[np.asarray(problem.camera_index)[0], :6] = 0
     points[np.asarray(problem.point_index)[0]] = 1, 1, 0
     observations = np.asarray(problem.observations), problem.camera_index, problem.point_index
@@ -378,7 +387,8 @@ def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys):
     """Frames 0 to 19 of sequence 00: 16 m of nearly straight road."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
-    out, poses = tmp_path / "kitti00.txt.bz2", str(root / "poses" / "00.txt")
+    out = tmp_path / "kitti00.txt.bz2"
+    poses = str(root / "poses" / "00.txt")
     options = ["--frames", "0:20", "--poses", poses, "--out", str(out)]
     assert run([str(root / "seq00"), *options]) == 0
     assert start_error(capsys.readouterr().out) < 0.5
@@ -392,11 +402,9 @@ def test_bundle_adjustment_ends_within_a_hundredth_of_the_real_drive_of_the_trut
     lies at 1.0 to 1.3 m."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
-    out, solved, poses = (
-        tmp_path / "k.txt.bz2",
-        tmp_path / "s.txt.bz2",
-        str(root / "poses" / "00.txt"),
-    )
+    out = tmp_path / "k.txt.bz2"
+    solved = tmp_path / "s.txt.bz2"
+    poses = str(root / "poses" / "00.txt")
     assert run([str(root / "seq00"), "--frames", "0:200", "--poses", poses, "--out", str(out)]) == 0
     assert solve([str(out), "--output", str(solved)]) == 0
     assert (

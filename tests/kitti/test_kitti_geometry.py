@@ -37,7 +37,8 @@ def street(views: int = 6, points: int = 40, seed: int = 0) -> tuple[np.ndarray,
 def sight(views: Views, points: np.ndarray) -> Observations:
     """Every point seen in every view."""
     count = len(views.rotation)
-    camera, track = np.tile(np.arange(count), len(points)), np.repeat(np.arange(len(points)), count)
+    camera = np.tile(np.arange(count), len(points))
+    track = np.repeat(np.arange(len(points)), count)
     local = (
         np.einsum("nij,nj->ni", views.rotation[camera], points[track]) + views.translation[camera]
     )
@@ -184,7 +185,9 @@ def drive(
     0.1 pixels."""
     random = np.random.default_rng(seed)
     places = np.concatenate([[0.0], np.cumsum(steps)])[:, None] * direction
-    image, track, pixels = [], [], []
+    image = []
+    track = []
+    pixels = []
     for link, views in enumerate(links):
         points = places[views[0]] + random.uniform([-8, -4, 10], [8, 3, 30], (80, 3))
         for view in views:
@@ -300,7 +303,8 @@ def test_the_angle_is_that_between_the_farthest_views():
 def test_filters_refuse_points_behind_far_and_wrong():
     _, views, points = street(points=4)
     focal = 700.0
-    behind, far = points.copy(), points.copy()
+    behind = points.copy()
+    far = points.copy()
     behind[0] = points[0] - [0, 0, 200]
     far[1] = points[1] + [0, 0, 5000]
     where = np.array([behind[0], far[1], points[2], points[3]])

@@ -94,8 +94,10 @@ def test_the_alignment_minimises_the_rmse_over_all_similarities():
 
 
 def test_the_rotation_is_that_of_scipys_wahba_solution():
-    source, target = wander(12, 4)[:, :, 3], wander(12, 5)[:, :, 3]
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    source = wander(12, 4)[:, :, 3]
+    target = wander(12, 5)[:, :, 3]
+    a = source - source.mean(axis=0)
+    b = target - target.mean(axis=0)
     turn, _ = Rotation.align_vectors(b, a)
     np.testing.assert_allclose(umeyama(source, target).rotation, turn.as_matrix(), atol=1e-9)
 
@@ -167,12 +169,17 @@ def test_a_path_that_is_five_percent_too_long_has_segment_errors_of_five_percent
 
 def devkit(estimate: np.ndarray, truth: np.ndarray, lengths) -> tuple[float, float, int]:
     """`calcSequenceErrors` of the development kit, line by line."""
-    square = lambda poses: [np.vstack([pose, [0, 0, 0, 1]]) for pose in poses]
-    gt, result = square(truth), square(estimate)
+
+    def square(poses):
+        return [np.vstack([pose, [0, 0, 0, 1]]) for pose in poses]
+
+    gt = square(truth)
+    result = square(estimate)
     dist = [0.0]
     for i in range(1, len(gt)):
         dist.append(dist[-1] + np.sqrt(sum((gt[i][k, 3] - gt[i - 1][k, 3]) ** 2 for k in range(3))))
-    t_err, r_err = [], []
+    t_err = []
+    r_err = []
     for first_frame in range(0, len(gt), 10):
         for length in lengths:
             last_frame = next(

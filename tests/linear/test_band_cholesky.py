@@ -40,7 +40,8 @@ def system(cameras: int, width: int, tile: int) -> tuple[Band, np.ndarray, np.nd
         | (row - column == width)
         | ((row - column < width) & (rng.random(len(row)) < 0.5))
     )
-    row, column = row[kept], column[kept]
+    row = row[kept]
+    column = column[kept]
     full = np.eye(9 * cameras).reshape(cameras, 9, cameras, 9)
     for a, b in zip(row, column, strict=True):
         two = rng.normal(size=(2, 9, 9)) / 3

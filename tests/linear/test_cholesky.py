@@ -25,7 +25,8 @@ def spd(n: int, condition: float = 1e4, seed: int = 0) -> np.ndarray:
 def triangle(panels: Panels) -> np.ndarray:
     """L from its panels."""
     n = sum(len(inverse) for inverse in panels.inverses)
-    lower, start = np.zeros((n, n)), 0
+    lower = np.zeros((n, n))
+    start = 0
     for inverse, below in zip(panels.inverses, panels.below, strict=True):
         stop = start + len(inverse)
         lower[start:stop, start:stop] = np.linalg.inv(inverse)
@@ -40,7 +41,8 @@ SIZES = [1, 9, MIN_UNKNOWNS - 1, MIN_UNKNOWNS, MIN_UNKNOWNS + 1]
 
 @pytest.mark.parametrize("n", SIZES)
 def test_a_system_is_solved_as_numpy_solves_it_from_its_lower_triangle_alone(n):
-    matrix, right = spd(n), np.random.default_rng(1).normal(size=n)
+    matrix = spd(n)
+    right = np.random.default_rng(1).normal(size=n)
     expected = np.linalg.solve(matrix, right)
     found = solve(np.where(np.tri(n, dtype=bool), matrix, 1e6), right)
     assert np.linalg.norm(found - expected) <= 1e-11 * np.linalg.norm(expected)
@@ -48,7 +50,8 @@ def test_a_system_is_solved_as_numpy_solves_it_from_its_lower_triangle_alone(n):
 
 @pytest.mark.parametrize("n", SIZES)
 def test_a_matrix_with_one_negative_eigenvalue_has_no_finite_solution(n):
-    matrix, right = spd(n), np.ones(n)
+    matrix = spd(n)
+    right = np.ones(n)
     assert np.isfinite(solve(matrix - 0.9e-4 * np.eye(n), right)).all()
     assert not np.isfinite(solve(matrix - 1.1e-4 * np.eye(n), right)).all()
 
@@ -57,7 +60,8 @@ def test_a_matrix_with_one_negative_eigenvalue_has_no_finite_solution(n):
 def test_units_of_the_unknowns_do_not_matter(n):
     """Focal lengths in pixels beside rotations in radians: the scale spans 24 orders of
     magnitude."""
-    matrix, right = spd(n), np.random.default_rng(1).normal(size=n)
+    matrix = spd(n)
+    right = np.random.default_rng(1).normal(size=n)
     unit = np.random.default_rng(2).permutation(np.geomspace(1e-6, 1e6, n))
     found = solve(matrix * unit[:, None] * unit, right * unit) * unit
     expected = np.linalg.solve(matrix, right)
@@ -75,7 +79,8 @@ def test_one_bad_entry_on_the_diagonal_is_enough_in_the_first_panel_and_in_the_l
 
 @pytest.mark.parametrize("n", [MIN_UNKNOWNS - 1, MIN_UNKNOWNS])
 def test_float32_is_solved_to_single_precision(n):
-    matrix, right = spd(n, condition=100), np.random.default_rng(1).normal(size=n)
+    matrix = spd(n, condition=100)
+    right = np.random.default_rng(1).normal(size=n)
     found = solve(matrix.astype(np.float32), right.astype(np.float32))
     assert found.dtype == jnp.float32
     expected = np.linalg.solve(matrix, right)
@@ -103,7 +108,8 @@ def test_large_systems_get_wider_panels_instead_of_more(monkeypatch, n, sizes):
     """As with more than 24 panels of 128, at the size of a test."""
     monkeypatch.setattr(cholesky, "PANEL", 8)
     monkeypatch.setattr(cholesky, "MAX_PANELS", 4)
-    matrix, right = spd(n, condition=100), np.random.default_rng(1).normal(size=n)
+    matrix = spd(n, condition=100)
+    right = np.random.default_rng(1).normal(size=n)
     panels, found = jax.jit(lambda a, b: ((p := factor_panels(a)), p.solve(b)))(matrix, right)
     assert [len(inverse) for inverse in panels.inverses] == sizes
     lower = triangle(panels)

@@ -48,9 +48,13 @@ def parts(layout, problem, damping):
     state = initial_state(layout, problem, OPTIONS, jnp.float64)
     linear = only_free(layout, linearize(layout, state.cameras, state.points, OPTIONS.loss), "free")
     system = DampedSystem.of(layout, linear, state.cameras, state.points, damping, OPTIONS)
-    shape, project = system.cameras.right.shape, layout.unknowns.project
+    shape = system.cameras.right.shape
+    project = layout.unknowns.project
     unit = jnp.eye(shape[0] * shape[1]).reshape(-1, *shape)
-    of = lambda operator: jax.vmap(operator)(unit).reshape(len(unit), -1)
+
+    def of(operator):
+        return jax.vmap(operator)(unit).reshape(len(unit), -1)
+
     inverses = [preconditioner(system, None, name) for name in ("schur-jacobi", "two-level")]
     between = [of(lambda x, inverse=inverse: project(inverse(project(x)))) for inverse in inverses]
     return linear, system.cameras.own, system.points.damping, of(project), between
@@ -68,12 +72,14 @@ def test_the_coarse_level_raises_the_least_eigenvalue_and_none_by_more_than_one(
     layout = build_layout(problem, OPTIONS)
     linear, own, of_points, projector, inverses = parts(layout, problem, jnp.asarray(damping))
     rows = 2 * len(layout.slot_camera)
-    camera, point = np.zeros((rows, *own.shape[:2])), np.zeros((rows, 3, len(of_points[0])))
+    camera = np.zeros((rows, *own.shape[:2]))
+    point = np.zeros((rows, 3, len(of_points[0])))
     for k in range(2):
         at = np.arange(k, rows, 2)
         camera[at, layout.slot_camera] = np.transpose(linear.camera_jacobian[k])
         point[at, :, layout.slot_point] = np.transpose(linear.point_jacobian[k])
-    camera, point = camera.reshape(rows, -1), point.reshape(rows, -1)
+    camera = camera.reshape(rows, -1)
+    point = point.reshape(rows, -1)
     coupling = camera.T @ point
     schur = camera.T @ camera + block_diag(*own)
     schur -= coupling @ np.linalg.solve(

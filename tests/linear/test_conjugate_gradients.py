@@ -20,7 +20,10 @@ ALWAYS = {"forcing": 0.0, "tolerance": 0.0}
 @functools.partial(jax.jit, static_argnames=("forcing", "tolerance", "max_iterations"))
 def run(matrix, b, inverse, *, forcing, tolerance, max_iterations):
     """`conjugate_gradients` on vectors of shape (n, 3), as the solver has them in blocks."""
-    times = lambda m: lambda x: (m @ x.reshape(-1)).reshape(x.shape)
+
+    def times(m):
+        return lambda x: (m @ x.reshape(-1)).reshape(x.shape)
+
     return conjugate_gradients(
         times(matrix),
         b,
@@ -35,7 +38,8 @@ def run(matrix, b, inverse, *, forcing, tolerance, max_iterations):
 def test_iterates_are_those_of_jax(kind):
     """`jax.scipy.sparse.linalg.cg` on the same operator with the same preconditioner, cut off at
     the same count."""
-    matrix, b = spd(1e3), right()
+    matrix = spd(1e3)
+    b = right()
     inverse = PRECONDITIONERS[kind](matrix)
     for count in (1, 2, 5, 11):
         found, done = run(matrix, b, inverse, **ALWAYS, max_iterations=count)
@@ -57,7 +61,8 @@ def test_iterates_are_those_of_jax(kind):
 def test_columns_that_are_divided_by_something_make_the_same_iterates(kind):
     """DeepLM divides columns by `1 + |J_j|`: with a preconditioner of diagonal blocks that changes
     no step."""
-    matrix, b = spd(1e3), right()
+    matrix = spd(1e3)
+    b = right()
     scale = 1 / (1 + np.sqrt(np.diag(matrix)))
     scaled = matrix * scale * scale[:, None]
     for count in (1, 3, 8):
@@ -80,7 +85,8 @@ def test_columns_that_are_divided_by_something_make_the_same_iterates(kind):
 
 @pytest.mark.parametrize("condition", [1e1, 1e4, 1e8])
 def test_convergence_gives_the_solution_of_numpy(condition):
-    matrix, b = spd(condition), right()
+    matrix = spd(condition)
+    b = right()
     found, count = run(matrix, b, np.eye(SIZE), forcing=0.0, tolerance=1e-14, max_iterations=5000)
     expected = np.linalg.solve(matrix, b.reshape(-1))
     error = found.reshape(-1) - expected
@@ -123,7 +129,9 @@ def test_the_inverse_as_preconditioner_needs_one_iteration():
 def test_the_forcing_term_stops_where_ceres_stops(forcing):
     """First i with `i (Q_i - Q_(i-1)) / Q_i < forcing`, `Q = x.Ax - 2 b.x`, computed from the
     textbook iterates."""
-    matrix, b, inverse = spd(40), right(), np.eye(SIZE)
+    matrix = spd(40)
+    b = right()
+    inverse = np.eye(SIZE)
     flat = b.reshape(-1)
     models = [0.0] + [x @ matrix @ x - 2 * flat @ x for x in by_hand(matrix, b, inverse, SIZE)]
     expected = next(
@@ -150,7 +158,8 @@ def test_a_larger_forcing_term_never_needs_more_iterations():
 
 
 def test_the_tolerance_is_a_share_of_the_right_hand_side():
-    matrix, b = spd(100), right()
+    matrix = spd(100)
+    b = right()
     for tolerance in (1e-1, 1e-3, 1e-6):
         found, count = run(
             matrix, b, np.eye(SIZE), forcing=0.0, tolerance=tolerance, max_iterations=500
@@ -195,7 +204,9 @@ def test_a_zero_right_hand_side_has_a_zero_solution_and_costs_nothing():
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_number_that_is_not_finite_makes_the_result_not_finite(place, bad):
     """Else a failed factorisation would look like a zero step."""
-    matrix, b, inverse = spd(10), right(), np.eye(SIZE)
+    matrix = spd(10)
+    b = right()
+    inverse = np.eye(SIZE)
     target = {"right-hand side": b, "preconditioner": inverse, "operator": matrix}[place]
     target[0, 0] = bad
     found, count = run(matrix, b, inverse, forcing=0.1, tolerance=1e-6, max_iterations=100)
@@ -208,7 +219,10 @@ def test_a_batch_of_systems_equals_a_loop_of_systems():
     # iterations
     matrices = np.stack([spd(condition, seed) for seed, condition in enumerate((2, 5, 12, 30))])
     b = np.stack([right(seed) for seed in range(4)])
-    solve = lambda m, b: run(m, b, jnp.eye(SIZE), forcing=1e-3, tolerance=1e-9, max_iterations=200)
+
+    def solve(m, b):
+        return run(m, b, jnp.eye(SIZE), forcing=1e-3, tolerance=1e-9, max_iterations=200)
+
     found, counts = jax.vmap(solve)(matrices, b)
     for k in range(4):
         alone, count = solve(matrices[k], b[k])

@@ -83,7 +83,8 @@ def test_every_solver_takes_the_dense_normal_equation_step(name, damping):
     found = support.difference(problem, support.back(problem, before, after), OPTIONS[name])
     assert expected.norm(found - expected.step) <= 1e-8 * expected.norm(expected.step)
     size = problem.cameras.size
-    cameras, wanted = found[:size].reshape(-1, 9), expected.step[:size].reshape(-1, 9)
+    cameras = found[:size].reshape(-1, 9)
+    wanted = expected.step[:size].reshape(-1, 9)
     for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
         assert np.linalg.norm((cameras - wanted)[:, part]) <= 1e-8 * np.linalg.norm(wanted[:, part])
     assert np.linalg.norm(found[size:] - expected.step[size:]) <= 1e-8 * np.linalg.norm(

@@ -90,7 +90,8 @@ class Case:
     @property
     def prolongation(self) -> np.ndarray:
         """P: the modes of each camera in the columns of its cluster."""
-        label, modes = self.found.label, self.found.modes
+        label = self.found.label
+        modes = self.found.modes
         dense = np.zeros((len(label), 9, label.max() + 1, MODES))
         dense[np.arange(len(label)), :, label] = modes
         return dense.reshape(9 * len(label), -1)
@@ -165,7 +166,9 @@ def case(request) -> Case:
 
 @pytest.mark.slow
 def test_the_cases_have_the_clusters_that_they_are_named_after():
-    count = lambda name: make(name).found.label.max() + 1
+    def count(name):
+        return make(name).found.label.max() + 1
+
     names = ("three-clusters", "unseen-camera", "two-cameras", "single")
     assert [count(name) for name in names] == [3, 4, 1, 1]
     assert (
@@ -183,7 +186,9 @@ def test_the_cases_have_the_clusters_that_they_are_named_after():
 @pytest.mark.parametrize("mode", range(7))
 def test_no_residual_changes_where_cameras_and_points_follow_one_similarity(name, mode):
     """Central differences; the points move by the similarity itself, the cameras along the mode."""
-    problem, modes, along = make(name).problem, make(name).found.modes[:, :, mode], np.eye(7)[mode]
+    problem = make(name).problem
+    modes = make(name).found.modes[:, :, mode]
+    along = np.eye(7)[mode]
     size = 1e-4
 
     def residual(by: float, points_too: bool = True) -> np.ndarray:

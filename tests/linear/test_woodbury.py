@@ -14,7 +14,8 @@ from jaxba.linear import factored
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.structure.density import has_few_points
 
-CAMERAS, COLUMNS = 4, 6
+CAMERAS = 4
+COLUMNS = 6
 
 
 def system(seed: int = 0, smallest: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -81,7 +82,9 @@ def test_columns_without_an_observation_change_nothing():
 
 def test_a_system_that_is_not_positive_definite_has_no_finite_solution_and_harms_no_neighbour():
     """Once by the coupling, once by a camera's own block."""
-    good, by_coupling, by_block = system(), system(1, smallest=-1e-6), system(2)
+    good = system()
+    by_coupling = system(1, smallest=-1e-6)
+    by_block = system(2)
     by_block[1][-1] -= 12 * np.eye(9)
     assert np.linalg.eigvalsh(by_block[1][-1])[0] < 0
     batch = [np.stack(parts) for parts in zip(good, by_coupling, by_block, system(3), strict=True)]
@@ -138,9 +141,10 @@ def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypat
     one = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
     monkeypatch.setattr(factored, "has_few_points", lambda points, cameras: False)
     other = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
-    moved = lambda after: jax.tree.leaves(
-        jax.tree.map(lambda a, b: np.asarray(a - b), after, before)
-    )
+
+    def moved(after):
+        return jax.tree.leaves(jax.tree.map(lambda a, b: np.asarray(a - b), after, before))
+
     for found, truth in zip(moved(one), moved(other), strict=True):
         assert np.linalg.norm(found - truth) <= 1e-7 * np.linalg.norm(truth)
     assert not support.same_bits(one, before)

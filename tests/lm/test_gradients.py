@@ -44,10 +44,8 @@ TO_THE_END = ConjugateGradients(forcing=0.0, tolerance=1e-14, max_iterations=500
 def in_first_camera(problem: BundleProblem) -> BundleProblem:
     """The same scene in the coordinates of camera 0, which then stands in the origin without
     rotation."""
-    rotations, translations = (
-        geometry.rotation_matrices(problem.cameras[:, :3]),
-        problem.cameras[:, 3:6],
-    )
+    rotations = geometry.rotation_matrices(problem.cameras[:, :3])
+    translations = problem.cameras[:, 3:6]
     turned = rotations @ rotations[0].T
     cameras = np.array(problem.cameras)
     cameras[:, :3] = geometry.angle_axis(turned)
@@ -67,7 +65,8 @@ def sequence() -> BundleProblem:
 
 def shared() -> BundleProblem:
     """`tiny` with three lenses, of which one is held fast and one is not distorted."""
-    problem, index = support.tiny(), np.array([0, 1, 0, 2, 1, 0])
+    problem = support.tiny()
+    index = np.array([0, 1, 0, 2, 1, 0])
     cameras = np.array(problem.cameras)
     cameras[:, 6:] = cameras[[0, 1, 0, 3, 1, 0], 6:]
     free = np.array([[1, 1, 0], [1, 1, 1], [0, 0, 0]], bool)
@@ -150,11 +149,15 @@ def directions(at, seed: int = 0):
 
 def differences(function, at, direction, width: float):
     """Central differences of fourth order."""
-    value = lambda scale: function(
-        *(x + scale * width * d for x, d in zip(at, direction, strict=True))
-    )
+
+    def value(scale):
+        return function(*(x + scale * width * d for x, d in zip(at, direction, strict=True)))
+
     near, far = ([value(sign * scale) for sign in (1, -1)] for scale in (1, 2))
-    slope = lambda a, b, c, d: (8 * (a - b) - (c - d)) / (12 * width)
+
+    def slope(a, b, c, d):
+        return (8 * (a - b) - (c - d)) / (12 * width)
+
     return jax.tree.map(slope, *near, *far)
 
 
@@ -162,7 +165,10 @@ def rounding_of(function, at, values) -> dict:
     """How far each number moves where the arguments move in their last digits: what rounding alone
     may change it by."""
     moved = [function(*(x * (1 + sign * 2 * np.finfo(float).eps) for x in at)) for sign in (-1, 1)]
-    size = lambda x: 3e-15 * np.linalg.norm(x)
+
+    def size(x):
+        return 3e-15 * np.linalg.norm(x)
+
     return {
         k: size(x) + max(np.linalg.norm(other[k] - x) for other in moved) for k, x in values.items()
     }
@@ -172,10 +178,12 @@ def check_forward(function, at, width: float = 3e-7) -> None:
     forward = jax.jit(lambda at, direction: jax.jvp(function, at, direction)[1])
     rounding = rounding_of(function, at, function(*at))
     for direction in directions(at):
-        found, expected = forward(at, direction), differences(function, at, direction, width)
+        found = forward(at, direction)
+        expected = differences(function, at, direction, width)
         for name, slope in found.items():
             assert np.isfinite(slope).all(), name
-            error, size = np.linalg.norm(slope - expected[name]), np.linalg.norm(slope)
+            error = np.linalg.norm(slope - expected[name])
+            size = np.linalg.norm(slope)
             assert error <= 1e-5 * size + 4 * rounding[name] / width, (
                 name,
                 error,
@@ -201,7 +209,10 @@ def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(n
         k: jnp.asarray(rng.normal(size=x.shape) / (1 + np.abs(x).max()))
         for k, x in function(*at).items()
     }
-    total = lambda *at: sum(jnp.sum(weights[k] * x) for k, x in function(*at).items())
+
+    def total(*at):
+        return sum(jnp.sum(weights[k] * x) for k, x in function(*at).items())
+
     gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*at)
     assert all(np.isfinite(x).all() for x in gradient)
     forward = jax.jit(lambda direction: jax.jvp(total, at, direction)[1])
@@ -218,8 +229,12 @@ def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(n
 @pytest.mark.slow
 def test_the_jacobian_is_made_of_forward_derivatives():
     function, at = as_function(*FACTORED["dense"])
-    cost = lambda cameras: function(cameras, *at[1:])["candidate_cost"]
-    jacobian, gradient = jax.jacfwd(cost)(at[0]), jax.grad(cost)(at[0])
+
+    def cost(cameras):
+        return function(cameras, *at[1:])["candidate_cost"]
+
+    jacobian = jax.jacfwd(cost)(at[0])
+    gradient = jax.grad(cost)(at[0])
     np.testing.assert_allclose(jacobian, gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 

@@ -152,7 +152,9 @@ def test_the_step_is_traced_once_for_all_dampings_states_and_thresholds():
 
 
 def test_shapes_depend_on_sizes_alone_for_scenes_where_all_is_visible():
-    shapes = lambda seed: [(x.shape, x.dtype) for x in jax.tree.leaves(start(support.paper(seed)))]
+    def shapes(seed):
+        return [(x.shape, x.dtype) for x in jax.tree.leaves(start(support.paper(seed)))]
+
     assert shapes(0) == shapes(1) == shapes(17)
 
 

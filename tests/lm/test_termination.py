@@ -70,7 +70,8 @@ def test_the_estimated_distance_to_the_end_is_not_too_small_on_a_parabola(
 ):
     """`end` is the cost at the minimum."""
     decrease, undamped, share = quadratic_step(curvature, damping, gradient)
-    before, after = end + undamped, end + undamped - decrease
+    before = end + undamped
+    after = end + undamped - decrease
     if decrease < 1e-9 * before or share > 1 - 1e-9:
         return  # rounding decides
     info = step_info(True, cost=after, previous_cost=before, damping_fraction=share)

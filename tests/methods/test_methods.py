@@ -87,7 +87,8 @@ def test_stba_with_one_cluster_is_the_exact_step(make, damping):
 @pytest.mark.parametrize("damping", [1e-4, 1e-2, 1.0])
 def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
     """To 1e-10 of the step, in the norm of the damped Hessian, which both solve."""
-    problem, made = support.tiny(), []
+    problem = support.tiny()
+    made = []
     for kind in (ONE_CLUSTER, StepOptions()):
         layout, before = start(problem, kind)
         after, info = step(layout, before, damping, kind)
@@ -102,7 +103,8 @@ def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
 def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a
     point together."""
-    problem, options = support.tiny(), MANIFOLD
+    problem = support.tiny()
+    options = MANIFOLD
     system, part = systems(problem, options, damping)
     split = eliminate_replicas(system.layout, system.linear, jnp.asarray(damping), part, options)
     right = lift_to_cameras(system.layout, system.linear, *split) - system.cameras.gradient
@@ -115,7 +117,8 @@ def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
 def test_the_split_reduced_system_is_block_diagonal():
     """The dense Schur complement of the split problem has nothing outside the clusters; that of the
     true one has."""
-    problem, options = support.tiny(), MANIFOLD
+    problem = support.tiny()
+    options = MANIFOLD
     label = np.asarray(systems(problem, options, 1e-3)[-1].label)
     apart = np.repeat(label, 9)[:, None] != np.repeat(label, 9)
 
@@ -136,7 +139,8 @@ def test_the_split_reduced_system_is_block_diagonal():
 def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_iteration(damping):
     """In the norm of B the error, and in that of B^-1 the residual, falls by at least the spectral
     radius of `B^-1 (B - S)`, which is below one."""
-    problem, options = support.tiny(), MANIFOLD
+    problem = support.tiny()
+    options = MANIFOLD
     system, part = systems(problem, options, damping)
     size = system.cameras.right.size
     basis = jnp.eye(size).reshape(size, -1, 9)
@@ -150,10 +154,13 @@ def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_
     assert radius < 1
     exact = np.linalg.solve(matrix, np.asarray(system.cameras.right).ravel())
     first = clustered_step(system, part, options, repairs=0)
-    error = lambda x: np.linalg.norm(root.T @ (np.asarray(x).ravel() - exact))
-    residual = lambda x: np.linalg.norm(
-        np.linalg.solve(root, matrix @ (np.asarray(x).ravel() - exact))
-    )
+
+    def error(x):
+        return np.linalg.norm(root.T @ (np.asarray(x).ravel() - exact))
+
+    def residual(x):
+        return np.linalg.norm(np.linalg.solve(root, matrix @ (np.asarray(x).ravel() - exact)))
+
     for norm, whole in (
         (error, np.linalg.norm(root.T @ exact)),
         (residual, residual(np.zeros(size))),
@@ -171,7 +178,8 @@ def test_agreed_gradients_equal_the_published_projection():
     layout = system.layout
     rng = np.random.default_rng(0)
     copies = part.levels[-1].shape[0]
-    gradient, diagonal = rng.normal(size=(3, copies)), rng.uniform(0.1, 9, size=(3, copies))
+    gradient = rng.normal(size=(3, copies))
+    diagonal = rng.uniform(0.1, 9, size=(3, copies))
     found = np.asarray(
         consensus_gradient(layout, part, jnp.asarray(diagonal), jnp.asarray(gradient))
     )
@@ -182,7 +190,8 @@ def test_agreed_gradients_equal_the_published_projection():
         )
         own = np.unique(np.asarray(part.slot_replica)[slots])
         for k in range(3):
-            g, d = gradient[k, own], diagonal[k, own]
+            g = gradient[k, own]
+            d = diagonal[k, own]
             expected = g
             if len(own) > 1:
                 h = np.hstack([np.ones((len(own) - 1, 1)), -np.eye(len(own) - 1)])
@@ -194,8 +203,12 @@ def test_agreed_gradients_equal_the_published_projection():
 
 def test_copies_agree_from_lambda_one_on_and_not_before():
     system, part = systems(support.tiny(), CLUSTERED, 1.0)
-    plain = lambda damping: eliminate_replicas(*system[:2], jnp.asarray(damping), part, CLUSTERED)
-    below, above = plain(1 - 1e-9), plain(1.0)
+
+    def plain(damping):
+        return eliminate_replicas(*system[:2], jnp.asarray(damping), part, CLUSTERED)
+
+    below = plain(1 - 1e-9)
+    above = plain(1.0)
     assert np.abs(np.stack(below[1]) - np.stack(above[1])).max() > 0.1
     np.testing.assert_allclose(np.stack(below[0][0]), np.stack(above[0][0]), rtol=1e-6)
 
@@ -204,7 +217,8 @@ def test_copies_agree_from_lambda_one_on_and_not_before():
 def test_an_inexact_step_predicts_what_its_own_linear_model_says(options):
     """`-(g.d + d.H d / 2)` of the step that was made, not of the one that would solve the
     system."""
-    problem, damping = support.tiny(), 1e-2
+    problem = support.tiny()
+    damping = 1e-2
     layout, before = start(problem, options)
     after, info = step(layout, before, damping, options, -1e9)
     assert info.accepted

@@ -81,7 +81,8 @@ def test_rotation_is_differentiable_at_zero_with_the_generators_as_derivative():
 def test_left_jacobian_is_the_derivative_of_the_exponential():
     """`exp(w + h e) exp(w)^-1 = exp(J h e)`, by central differences on the group; error h^2 + eps /
     h."""
-    w, h = vectors(), 1e-5
+    w = vectors()
+    h = 1e-5
     found = matrices(rotations.left_jacobian, w)
     for k in range(3):
         ahead, behind = (Rotation.from_rotvec(w + s * h * IDENTITY[k]) for s in (1, -1))
@@ -111,7 +112,8 @@ def test_left_jacobian_inverse_is_the_inverse():
 def test_left_jacobian_inverse_is_the_derivative_of_the_logarithm():
     """`log(exp(h e) exp(w)) = w + J^-1 h e`, by central differences, away from half a turn where
     the log jumps."""
-    w, h = vectors([a for a in ANGLES if a < 3.1]), 1e-5
+    w = vectors([a for a in ANGLES if a < 3.1])
+    h = 1e-5
     found = matrices(rotations.left_jacobian_inverse, w)
     for k in range(3):
         ahead, behind = (
@@ -128,8 +130,10 @@ def test_composition_is_that_of_scipy():
     some = vectors(
         [0.0, 1e-12, 1e-8, THRESHOLD * (1 - 1e-9), THRESHOLD * (1 + 1e-9), 0.3, 2.5, np.pi]
     )
-    step, w = np.repeat(some, len(some), axis=0), np.tile(some, (len(some), 1))
-    step, w = np.vstack([step, -some]), np.vstack([w, some])
+    step = np.repeat(some, len(some), axis=0)
+    w = np.tile(some, (len(some), 1))
+    step = np.vstack([step, -some])
+    w = np.vstack([w, some])
     found = np.array(rotations.compose_left(jnp.asarray(step.T), jnp.asarray(w.T))).T
     expected = Rotation.from_rotvec(step) * Rotation.from_rotvec(w)
     np.testing.assert_allclose(
@@ -149,7 +153,8 @@ def test_composition_with_a_tiny_step_loses_no_digit_of_the_step():
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=6, max_size=6))
 def test_composition_multiplies_matrices(numbers):
-    step, w = np.array(numbers[:3]), np.array(numbers[3:])
+    step = np.array(numbers[:3])
+    w = np.array(numbers[3:])
     found = np.asarray(
         rotations.compose_left(jnp.asarray(step[:, None]), jnp.asarray(w[:, None]))
     ).T
@@ -268,7 +273,8 @@ def test_derivatives_equal_central_differences(kind):
         return (ends[0] - ends[1]) / (2 * h)[:, None]
 
     # h far below the depth; f, k1 and k2 enter linearly
-    small, unit = 1e-5 * np.minimum(depth, 1), np.ones(len(points))
+    small = 1e-5 * np.minimum(depth, 1)
+    unit = np.ones(len(points))
     columns = [(0, k, small, by_camera[:, :, k]) for k in range(3)]
     columns += [(1, k, small if k < 6 else unit, by_camera[:, :, k]) for k in range(3, 9)]
     columns += [(2, k, small, by_point[:, :, k]) for k in range(3)]

@@ -63,7 +63,8 @@ def dense_sums(problem: BundleProblem, loss: Loss) -> np.ndarray:
     """The same but the last, by matrices."""
     residual, jacobian = support.linear(problem, StepOptions(loss=loss))
     by_point = jacobian[:, problem.cameras.size :]
-    hessian, gradient = by_point.T @ by_point, by_point.T @ residual
+    hessian = by_point.T @ by_point
+    gradient = by_point.T @ residual
     first = 3 * np.arange(problem.num_points)
     entries = [hessian[first + i, first + j] for i in range(3) for j in range(i + 1)]
     unweighted = support.linear(problem, StepOptions())[0].reshape(-1, 2)
@@ -140,7 +141,8 @@ def test_point_iterations_are_the_same_in_fast_compilation(loss):
                 lambda layout, points: refine_points(layout, state.cameras, frames, points, loss, 3)
             )(layout, state.points)
 
-    (points, costs), (stored_points, stored_costs) = found(False), found(True)
+    (points, costs) = found(False)
+    (stored_points, stored_costs) = found(True)
     np.testing.assert_allclose(points, stored_points, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(costs, stored_costs, rtol=1e-9, atol=1e-12)
 
@@ -155,9 +157,11 @@ def test_many_scenes_at_once_get_what_each_gets_alone():
         one_pass = point_passes(layout, slot_frames(layout, state.cameras))
         return jnp.stack(one_pass(state.points, lambda views: point_terms(views, Loss())))
 
-    stack = lambda trees: jax.tree.map(
-        lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees
-    )
+    def stack(trees):
+        return jax.tree.map(
+            lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees
+        )
+
     together = jax.jit(jax.vmap(found))(stack(layouts), stack(problems))
     one = jax.jit(found)
     alone = [one(layout, problem) for layout, problem in zip(layouts, problems, strict=True)]

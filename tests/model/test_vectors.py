@@ -28,7 +28,8 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_vectors_are_those_of_the_mapped_function(name):
-    function, random = FUNCTIONS[name], np.random.default_rng(0)
+    function = FUNCTIONS[name]
+    random = np.random.default_rng(0)
     given = [jnp.asarray(random.standard_normal((*shape, 7))) for shape in ((3, 3), (3,), ())]
     numbers = [numbers_of(x, x.ndim - 1) for x in given]
     traced = Traced(function, *numbers)

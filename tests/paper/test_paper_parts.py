@@ -320,9 +320,12 @@ def test_rule_for_errors(excess, status):
 )
 def test_a_claim_about_speed_asks_for_the_same_success(ours, faster, status):
     """Seconds to tau = 0.001 of two problems, where classic takes two."""
-    solve = lambda name, solver, seconds, end: dataclasses.replace(
-        record(name, [100.0, end], step_s=seconds, setup_s=0.0), solver=solver
-    )
+
+    def solve(name, solver, seconds, end):
+        return dataclasses.replace(
+            record(name, [100.0, end], step_s=seconds, setup_s=0.0), solver=solver
+        )
+
     records = [solve(name, "classic", 2.0, 1.0) for name in "ab"]
     records += [
         solve(name, agents.BEST.name, ours.get(name, 1.0), 1.0 if name in ours else 50.0)
@@ -332,7 +335,8 @@ def test_a_claim_about_speed_asks_for_the_same_success(ours, faster, status):
 
 
 def test_more_seconds_are_a_claim_of_their_own():
-    ours, base = of(4)._replace(seconds=1.25), of(20)._replace(seconds=1.0)
+    ours = of(4)._replace(seconds=1.25)
+    base = of(20)._replace(seconds=1.0)
     found = claims.longer_claim("claim", "+0.5 s", ours, base)
     assert (found.status, found.ours) == ("reproduced", "+250.0 ms (1250 / 1000 ms)")
     assert claims.longer_claim("claim", "+0.5 s", base, ours).status == "not"
@@ -457,12 +461,15 @@ def test_files_and_their_sub_problems_are_found_and_missing_ones_are_reported(
     ]
     assert found.missing == ("$JAXBA_DATA/other.txt",)
     assert found.reason == ""
-    names = lambda whole: [
-        s.name
-        for s in real_problems.bal(
-            config.RealConfig((dataclasses.replace(family, whole=whole),))
-        ).sources
-    ]
+
+    def names(whole):
+        return [
+            s.name
+            for s in real_problems.bal(
+                config.RealConfig((dataclasses.replace(family, whole=whole),))
+            ).sources
+        ]
+
     assert names(True) == [source.name for source in found.sources]
     assert names(False) == names(True)[1:]
 
@@ -471,9 +478,15 @@ def test_an_agent_is_trained_on_other_problems_than_those_it_is_judged_on(monkey
     monkeypatch.setenv("JAXBA_DATA", str(tmp_path))
     for name in ("a-30", "a-40", "b-50", "drive-1", "drive-2"):
         (tmp_path / f"{name}.txt").write_text("")
-    of = lambda name: config.FamilyConfig(name, (f"$JAXBA_DATA/{name}-*.txt",), (5,))
+
+    def of(name):
+        return config.FamilyConfig(name, (f"$JAXBA_DATA/{name}-*.txt",), (5,))
+
     real = config.RealConfig((of("a"), of("b")), of("drive"))
-    path = lambda name: str(tmp_path / f"{name}.txt")
+
+    def path(name):
+        return str(tmp_path / f"{name}.txt")
+
     for source in real_problems.find(real.bal[0]).sources:  # a whole family of BAL is one place
         assert real_problems.training_files(real, source) == ("a", (path("b-50"),))
     *_, part = real_problems.find(real.kitti).sources

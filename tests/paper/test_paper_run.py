@@ -130,7 +130,8 @@ def test_only_a_missing_record_is_computed_again(finished, settings, capsys, los
     assert run(command(settings, finished)) == 0
     assert runs(capsys) == 1
     again = (finished / PLAYS).read_text().splitlines(keepends=True)
-    old, new = json.loads(lines[lost]), json.loads(again[-1])
+    old = json.loads(lines[lost])
+    new = json.loads(again[-1])
     assert {**old, "seconds": 0} == {**new, "seconds": 0}
     (finished / PLAYS).write_text("".join(lines))
 

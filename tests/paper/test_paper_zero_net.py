@@ -73,7 +73,9 @@ def test_the_gradient_of_a_weight_follows_the_chain_rule():
             (*hidden, Layer(last.kernel, last.bias + jnp.asarray(by, jnp.float32))), AGENT
         )
 
-    action = lambda bias: moved(bias).act(episode.memory)
+    def action(bias):
+        return moved(bias).act(episode.memory)
+
     h = 0.02
     expected = (next_cost(episode, float(action(h))) - next_cost(episode, float(action(-h)))) / (
         2 * h
@@ -89,7 +91,10 @@ def test_the_input_is_errors_actions_and_rewards_of_the_last_steps():
     one = _iterate(episode, jnp.asarray(0.25))[0]
     two, step = _iterate(one, jnp.asarray(-0.5))
     seen = np.asarray(zero_net.inputs(two.memory)).reshape(3, 3)
-    rms = lambda cost: np.sqrt(2 * float(cost) / float(first.info.observations))
+
+    def rms(cost):
+        return np.sqrt(2 * float(cost) / float(first.info.observations))
+
     errors = [min(rms(cost), 1000.0) for cost in (step.cost, one.state.cost, first.cost)]
     assert seen[0] == pytest.approx(errors, rel=1e-6)
     decades = [

@@ -105,14 +105,16 @@ def test_residuals_are_those_of_bal_also_behind_the_camera(make):
 
 
 def blocks(colmap: ColmapProblem, observation: int) -> tuple:
-    camera, point = colmap.start.camera_index[observation], colmap.start.point_index[observation]
+    camera = colmap.start.camera_index[observation]
+    point = colmap.start.point_index[observation]
     return colmap.points[point], colmap.poses[camera], colmap.lenses[camera]
 
 
 def test_the_python_cost_function_is_colmap_s_in_front_of_the_camera():
     colmap = ColmapProblem(support.tiny())
     for k in range(0, 200, 7):
-        theirs, mine = reprojection(colmap.pixels[k]), TwoSidedReprojection(colmap.pixels[k])
+        theirs = reprojection(colmap.pixels[k])
+        mine = TwoSidedReprojection(colmap.pixels[k])
         residual, jacobians = theirs.evaluate(*blocks(colmap, k))
         found = np.full(2, np.nan), [np.full(2 * size, np.nan) for size in (3, 7, 5)]
         assert mine.Evaluate(blocks(colmap, k), *found)
@@ -120,10 +122,12 @@ def test_the_python_cost_function_is_colmap_s_in_front_of_the_camera():
         # a quaternion's derivative along itself is free: only its tangent counts
         tangent = quaternion_tangent(blocks(colmap, k)[1][:4])
         for value, truth, size in zip(found[1], jacobians, (3, 7, 5), strict=True):
-            value, truth = value.reshape(2, size), np.asarray(truth).reshape(2, size)
+            value = value.reshape(2, size)
+            truth = np.asarray(truth).reshape(2, size)
             if size == 7:
                 value, truth = ([m[:, :4] @ tangent, m[:, 4:]] for m in (value, truth))
-                value, truth = np.hstack(value), np.hstack(truth)
+                value = np.hstack(value)
+                truth = np.hstack(truth)
             np.testing.assert_allclose(value, truth, rtol=1e-9, atol=1e-9 * np.abs(truth).max())
 
 
@@ -237,7 +241,10 @@ def test_ceres_alone_counts_them_too_and_does_not_record_a_step_twice(seed, capl
 def test_the_iterative_mode_counts_conjugate_gradients_and_the_direct_ones_have_none():
     for mode in ("dense", "sparse", "iterative"):
         terms = []
-        note = lambda record, terms=terms: terms.append(float(record.step.forcing))
+
+        def note(record, terms=terms):
+            return terms.append(float(record.step.forcing))
+
         found = solve_by_ceres(support.tiny(), mode, max_iterations=3, callback=note)
         assert found.linear_solver == mode
         assert (found.history.cg_iterations > 0).all() == (mode == "iterative")

@@ -114,7 +114,8 @@ def test_few_positions_or_ones_within_their_noise_say_what_they_can(images, scal
 
 
 def degrees(metres: np.ndarray, latitude: float) -> np.ndarray:
-    north, east = metres[:, 1] / EARTH, metres[:, 0] / EARTH / np.cos(np.radians(latitude))
+    north = metres[:, 1] / EARTH
+    east = metres[:, 0] / EARTH / np.cos(np.radians(latitude))
     return np.c_[latitude + np.degrees(north), 8.0 + np.degrees(east), 500 + metres[:, 2]]
 
 

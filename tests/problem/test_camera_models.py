@@ -47,7 +47,8 @@ def lens_of(name: str, rng: np.random.Generator) -> np.ndarray:
 
 def scene(*names: str, noise: float = 0.3, shared: bool = True) -> BundleProblem:
     """The cameras and points of a random scene, with lenses of these models in turn."""
-    plain, rng = support.tiny(), np.random.default_rng(1)
+    plain = support.tiny()
+    rng = np.random.default_rng(1)
     models = tuple(CAMERA_MODELS[name] for name in names)
     size = max(map(len, models))
     cameras = np.zeros((plain.num_cameras, 6 + size))
@@ -109,10 +110,14 @@ def test_residuals_and_derivatives_are_those_of_the_host_and_of_differences(name
         )
 
     mask = np.asarray(layout.slot_mask)
-    camera, point = np.asarray(layout.slot_camera)[mask], order[np.asarray(layout.slot_point)[mask]]
+    camera = np.asarray(layout.slot_camera)[mask]
+    point = order[np.asarray(layout.slot_point)[mask]]
     by_slot = np.lexsort((camera, point))
     by_host = np.lexsort((problem.camera_index, problem.point_index))
-    in_order = lambda rows: np.stack([np.asarray(row)[mask] for row in rows], axis=1)[by_slot]
+
+    def in_order(rows):
+        return np.stack([np.asarray(row)[mask] for row in rows], axis=1)[by_slot]
+
     np.testing.assert_allclose(
         in_order(linear.residual), residuals(0.0)[by_host], rtol=1e-9, atol=1e-9
     )
@@ -149,11 +154,12 @@ def test_a_users_own_model_is_solved_and_a_second_one_of_its_name_is_refused():
 
 @pytest.mark.slow
 def test_mixed_models_end_at_one_cost_with_every_linear_solver_and_embedded_iterations():
-    problem, ways = (
-        scene(*MIXED),
-        (("guarded", "explicit"), ("ceres", "sparse"), ("ceres", "implicit")),
-    )
-    options = lambda solver: SolveOptions(linear_solver=solver, max_iterations=60)
+    problem = scene(*MIXED)
+    ways = (("guarded", "explicit"), ("ceres", "sparse"), ("ceres", "implicit"))
+
+    def options(solver):
+        return SolveOptions(linear_solver=solver, max_iterations=60)
+
     costs = [solve(problem, policy, options(solver)).final_cost for policy, solver in ways]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-5)
 
@@ -168,7 +174,8 @@ def test_lenses_with_impossible_models_are_refused():
     problem = scene("PINHOLE")
     parts = (problem.cameras, *support.arrays(problem)[1:])
     models = (CAMERA_MODELS["PINHOLE"],)
-    index, free = problem.lenses.index, problem.lenses.free
+    index = problem.lenses.index
+    free = problem.lenses.free
     for lenses, message in (
         (
             Lenses(index, free, np.array([1]), models),

@@ -39,15 +39,17 @@ NOT_NEEDED = "is not needed"
 def model_of(folder: Path, cameras: int = 1, frames: int = 3, points: int = 60) -> Path:
     """A model of one rig with noise in pixels, poses and points."""
     pycolmap.set_random_seed(1)
-    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, cameras, frames
-    options.num_points3D, options.num_points2D_without_point3D = points, 0
+    options = pycolmap.SyntheticDatasetOptions()
+    noise = pycolmap.SyntheticNoiseOptions()
+    options.num_rigs = 1
+    options.num_cameras_per_rig = cameras
+    options.num_frames_per_rig = frames
+    options.num_points3D = points
+    options.num_points2D_without_point3D = 0
     model = pycolmap.synthesize_dataset(options)
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = (
-        0.5,
-        0.02,
-        0.3,
-    )
+    noise.point2D_stddev = 0.5
+    noise.point3D_stddev = 0.02
+    noise.rig_from_world_rotation_stddev = 0.3
     noise.rig_from_world_translation_stddev = 0.02
     pycolmap.synthesize_noise(noise, model)
     return written(model, folder)
@@ -95,14 +97,13 @@ def by_colmap(
     **options: bool,
 ) -> tuple[int, float]:
     """COLMAP's number of unknowns, and its cost at the end."""
-    model, config = pycolmap.Reconstruction(str(folder)), pycolmap.BundleAdjustmentConfig()
+    model = pycolmap.Reconstruction(str(folder))
+    config = pycolmap.BundleAdjustmentConfig()
     settings = pycolmap.BundleAdjustmentOptions(print_summary=False, **options)
     solver = settings.ceres.solver_options
-    solver.function_tolerance, solver.gradient_tolerance, solver.max_num_iterations = (
-        1e-15,
-        1e-12,
-        300,
-    )
+    solver.function_tolerance = 1e-15
+    solver.gradient_tolerance = 1e-12
+    solver.max_num_iterations = 300
     for image in model.reg_image_ids():
         config.add_image(image)
     for frame in frames:
@@ -181,7 +182,8 @@ def test_three_points_count_points_that_are_held(tmp_path, cameras, held):
     """Costs are compared with the same points held, since the programs choose others."""
     folder = model_of(tmp_path / "m", cameras)
     problem = hold(read_colmap(folder), points=range(10, 10 + held), extrinsics="all")
-    options, ids = CONSTANT if cameras > 1 else {}, problem.labels.points
+    options = CONSTANT if cameras > 1 else {}
+    ids = problem.labels.points
     count, _ = by_colmap(folder, "three-points", points=ids[10 : 10 + held], **options)
     found = gauged(
         problem,
@@ -225,16 +227,20 @@ def test_position_priors_fix_the_gauge_as_far_as_they_can(tmp_path, measured, ga
     """COLMAP leaves fewer than three priors out, and fixes the gauge. A similarity meets them: the
     cost is equal."""
     folder = model_of(tmp_path / "m", frames=10)
-    problem, rng = read_colmap(folder), np.random.default_rng(0)
+    problem = read_colmap(folder)
+    rng = np.random.default_rng(0)
     model = pycolmap.Reconstruction(str(folder))
     images = problem.labels.images[:measured].tolist()
     positions = [model.image(i).projection_center() + 0.02 * rng.normal(size=3) for i in images]
     count, cost = by_colmap(
         folder, priors=list(zip(images, positions, measured * [0.05], strict=True))
     )
-    add = lambda: with_position_priors(
-        problem, np.array(positions), stddev=0.05, images=range(measured)
-    )
+
+    def add():
+        return with_position_priors(
+            problem, np.array(positions), stddev=0.05, images=range(measured)
+        )
+
     if measured < 3:
         with pytest.warns(ProblemWarning, match="the alignment"):
             known = add()

@@ -108,7 +108,8 @@ def test_a_gauge_leaves_the_cost_that_is_found_without_it(gauge):
     numbers = fixed.constants.poses.sum() + 3 * fixed.constants.points.sum()
     assert numbers == (7 if gauge == "two-cameras" else 9)
     options = SolveOptions(max_iterations=300)
-    free, found = solve(problem, "ceres", options), solve(fixed, "ceres", options)
+    free = solve(problem, "ceres", options)
+    found = solve(fixed, "ceres", options)
     if gauge == "two-cameras":
         np.testing.assert_allclose(found.final_cost, free.final_cost, rtol=1e-5)
     else:
@@ -149,9 +150,10 @@ def moves(problem: BundleProblem) -> np.ndarray:
 def test_a_gauge_holds_what_constants_and_priors_leave_free(fixed, numbers):
     """Counted by hand: a pose is six numbers; a similarity has seven."""
     problem = fixed(support.tiny())
-    held = lambda p: (
-        0 if p.constants is None else p.constants.poses.sum() + 3 * p.constants.points.sum()
-    )
+
+    def held(p):
+        return 0 if p.constants is None else p.constants.poses.sum() + 3 * p.constants.points.sum()
+
     if numbers:
         found = with_gauge(problem, "two-cameras")
     else:
@@ -186,7 +188,8 @@ WRONG = [
 @pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: repr(wrong)[:12])
 def test_wrong_values_are_one_line_in_our_own_words(wrong, unchecked):
     problem = support.tiny()
-    centers, eye = geometry.camera_centers(problem.cameras), np.eye(3)
+    centers = geometry.camera_centers(problem.cameras)
+    eye = np.eye(3)
     calls = [
         *(
             lambda name=name: hold(problem, **{name: wrong})
@@ -232,8 +235,10 @@ def whitening(problem: BundleProblem) -> np.ndarray:
 
 
 def test_standard_deviations_are_one_number_three_or_those_of_each_image():
-    problem, centers = support.tiny(), geometry.camera_centers(support.tiny().cameras)
-    each, axes = np.array([0.1, 2.0, 0.1, 2.0, 0.1, 2.0]), np.array([0.1, 0.2, 0.3])
+    problem = support.tiny()
+    centers = geometry.camera_centers(support.tiny().cameras)
+    each = np.array([0.1, 2.0, 0.1, 2.0, 0.1, 2.0])
+    axes = np.array([0.1, 0.2, 0.3])
     for stddev, wanted in [
         (0.5, np.full((6, 3), 0.5)),
         (axes, np.tile(axes, (6, 1))),
@@ -284,7 +289,8 @@ SPREAD = np.array([0.01, 0.02, 0.03])
 
 def measurements() -> tuple[np.ndarray, np.ndarray]:
     """Positions of four images and rotations of all, with noise."""
-    problem, rng = support.tiny(), np.random.default_rng(3)
+    problem = support.tiny()
+    rng = np.random.default_rng(3)
     centers = geometry.camera_centers(problem.cameras)
     return centers[:4] + 0.3 * rng.normal(size=(4, 3)), problem.cameras[:, :3] + 0.05 * rng.normal(
         size=(6, 3)
@@ -307,7 +313,8 @@ def known() -> BundleProblem:
 def prior_residuals(problem: BundleProblem) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
-    (centers, turned), cameras = measurements(), np.asarray(problem.cameras)
+    (centers, turned) = measurements()
+    cameras = np.asarray(problem.cameras)
     position = (geometry.camera_centers(cameras)[:4] - centers) / np.sqrt(SPREAD)
     rotation = (
         10 * (Rotation.from_rotvec(cameras[:, :3]) * Rotation.from_rotvec(turned).inv()).as_rotvec()
@@ -404,7 +411,8 @@ def test_covariances_far_from_the_origin_are_those_near_it():
     cameras = np.array(near.cameras)
     cameras[:, 3:6] -= geometry.rotation_matrices(cameras[:, :3]) @ np.full(3, 1e5)
     far = near.replace(cameras=cameras, points=near.points + 1e5)
-    here, there = covariance(near), covariance(far)
+    here = covariance(near)
+    there = covariance(far)
     np.testing.assert_allclose(there.points, here.points, rtol=1e-3)
     np.testing.assert_allclose(there.poses[1, :3, :3], here.poses[1, :3, :3], rtol=1e-3)
     np.testing.assert_allclose(
@@ -422,7 +430,8 @@ def test_the_covariance_of_a_relative_pose_does_not_depend_on_the_gauge():
         poses[whole], poses[part, 3] = True, True
         return solved.replace(constants=Constants(poses, np.zeros(solved.num_points, bool)))
 
-    first, second = covariance(fixed(0, 5)), covariance(fixed(3, 2))
+    first = covariance(fixed(0, 5))
+    second = covariance(fixed(3, 2))
     scale = first.relative_pose(1, 4)[:3, :3], second.relative_pose(1, 4)[:3, :3]
     np.testing.assert_allclose(*scale, rtol=1e-4, atol=1e-12)  # of the rotation, whatever the scale
 

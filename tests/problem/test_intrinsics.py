@@ -66,7 +66,8 @@ def copy_matrix(problem: BundleProblem) -> np.ndarray:
     """T: a column for every number that is optimised, with a one where a parameter is that
     number."""
     assert problem.lenses is not None
-    columns, names = [], {}
+    columns = []
+    names = {}
     for parameter in range(problem.cameras.size + problem.points.size):
         camera, k = divmod(parameter, 9)
         name: tuple = (parameter,)
@@ -124,7 +125,8 @@ def test_a_step_is_that_of_the_dense_problem_with_shared_lenses(make, options, d
 
 
 def test_the_promised_decrease_and_the_gradient_are_those_of_the_problem_with_shared_lenses():
-    problem, options = shared(), StepOptions(coordinates=Coordinates(rotation="manifold"))
+    problem = shared()
+    options = StepOptions(coordinates=Coordinates(rotation="manifold"))
     layout, before = support.start(problem, options)
     _, info = support.step(layout, before, 1e-2, options)
     residual, jacobian = support.linear(problem, options)
@@ -144,10 +146,8 @@ def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
 
     def residuals(unknowns):
         every = start + copies @ unknowns
-        cameras, points = (
-            every[: problem.cameras.size].reshape(-1, 9),
-            every[problem.cameras.size :].reshape(-1, 3),
-        )
+        cameras = every[: problem.cameras.size].reshape(-1, 9)
+        points = every[problem.cameras.size :].reshape(-1, 3)
         return geometry.residuals(problem.replace(cameras=cameras, points=points)).ravel()
 
     truth = least_squares(
@@ -177,7 +177,8 @@ def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_
 def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
     problem = support.tiny()
     own = with_lenses(problem, np.arange(6), np.ones((6, 3), bool))
-    plain, same = solve(problem, "bold"), solve(own, "bold")
+    plain = solve(problem, "bold")
+    same = solve(own, "bold")
     np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-9)  # two programs
 
 
@@ -256,7 +257,8 @@ def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lens
     solver, preconditioner
 ):
     rule = ConjugateGradients(preconditioner, forcing=0.0, tolerance=1e-13, budget=200)
-    problem, options = unseen(), StepOptions(linear_solver=solver, conjugate_gradients=rule)
+    problem = unseen()
+    options = StepOptions(linear_solver=solver, conjugate_gradients=rule)
     layout, before = support.start(problem, options)
     after, info = support.step(layout, before, 1e-2, options, min_gain=-np.inf)
     assert info.cg_iterations > 0
@@ -315,7 +317,8 @@ def test_a_factorisation_that_needs_more_than_memory_is_refused(monkeypatch):
 @pytest.mark.parametrize("dtype", ["float32", "mixed"])
 def test_other_types_end_at_the_cost_of_float64_and_hold_what_is_held(dtype):
     problem = shared()
-    exact, rough = solve(problem, "ceres"), solve(problem, "ceres", dtype=dtype)
+    exact = solve(problem, "ceres")
+    rough = solve(problem, "ceres", dtype=dtype)
     np.testing.assert_allclose(geometry.cost(rough.problem), exact.final_cost, rtol=1e-5)
     held = ~FREE[INDEX]
     assert (rough.problem.cameras[:, 6:][held] == problem.cameras[:, 6:][held]).all()

@@ -44,9 +44,9 @@ def test_named_points_are_optimised_with_all_that_is_seen_of_them(scene):
     found = jaxba.solve(jaxba.part(scene, images=LOCAL, points=points), options=tight).problem
     moved = np.flatnonzero((found.points != scene.points).any(axis=1))
     assert set(points) <= set(moved)
-    of_point = lambda p: (
-        0.5 * np.sum(geometry.residuals(p)[np.asarray(p.point_index) == points[0]] ** 2)
-    )
+
+    def of_point(p):
+        return 0.5 * np.sum(geometry.residuals(p)[np.asarray(p.point_index) == points[0]] ** 2)
 
     def shifted(axis, by):
         array = found.points.copy()

@@ -195,7 +195,8 @@ def test_projection_is_the_formula_of_bal():
 
 def test_pieces_do_not_change_the_projection(monkeypatch):
     problem = small_problem()
-    whole, depth = project(problem), depths(problem)
+    whole = project(problem)
+    depth = depths(problem)
     monkeypatch.setattr(geometry, "CHUNK", 7)
     np.testing.assert_array_equal(project(problem), whole)
     np.testing.assert_array_equal(depths(problem), depth)
@@ -212,7 +213,8 @@ def test_cost_is_half_the_squared_mahalanobis_distance():
     rng = np.random.default_rng(6)
     root = rng.standard_normal((60, 2, 2)) + 3 * np.eye(2)
     covariance = root @ root.transpose(0, 2, 1)
-    plain, weighed = small_problem(), small_problem(covariance=covariance)
+    plain = small_problem()
+    weighed = small_problem(covariance=covariance)
     difference = plain.observations - project(plain)
     np.testing.assert_allclose(residuals(plain), difference)
     squares = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(covariance), difference)

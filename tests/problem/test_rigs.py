@@ -41,13 +41,12 @@ EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-13)
 def rigged(shared: bool = True) -> BundleProblem:
     """Six cameras in four frames, two of them of two cameras; the second is turned and moved in its
     rig."""
-    plain, rng = support.tiny(), np.random.default_rng(0)
+    plain = support.tiny()
+    rng = np.random.default_rng(0)
     matrices = geometry.rotation_matrices(plain.cameras[:, :3])
-    cameras, rotation, translation = (
-        np.array(plain.cameras),
-        np.tile(np.eye(3), (6, 1, 1)),
-        np.zeros((6, 3)),
-    )
+    cameras = np.array(plain.cameras)
+    rotation = np.tile(np.eye(3), (6, 1, 1))
+    translation = np.zeros((6, 3))
     # also the first may be anywhere
     rotation[0] = Rotation.from_rotvec([0.3, 0.1, -0.2]).as_matrix()
     for second, first in ((2, 0), (4, 1)):
@@ -70,12 +69,11 @@ def rigged(shared: bool = True) -> BundleProblem:
 def stereo() -> BundleProblem:
     """Six cameras in four frames, two of them of two cameras: the second has a lens of its own, and
     is not quite where its rig says it is."""
-    plain, rng = support.tiny(), np.random.default_rng(1)
-    cameras, rotation, translation = (
-        np.array(plain.cameras),
-        np.tile(np.eye(3), (6, 1, 1)),
-        np.zeros((6, 3)),
-    )
+    plain = support.tiny()
+    rng = np.random.default_rng(1)
+    cameras = np.array(plain.cameras)
+    rotation = np.tile(np.eye(3), (6, 1, 1))
+    translation = np.zeros((6, 3))
     index = np.array([0, 0, 1, 0, 1, 0])
     cameras[:, 6:] = cameras[index, 6:]
     matrices = geometry.rotation_matrices(cameras[:, :3])
@@ -101,7 +99,9 @@ def stereo() -> BundleProblem:
 def copies_of(problem: BundleProblem) -> tuple[dict, np.ndarray]:
     """The unknowns, and T: the steps of all parameters (rotations on the manifold) for unit steps
     of them."""
-    size, names, columns = 9 * 6 + 3 * problem.num_points, {}, []
+    size = 9 * 6 + 3 * problem.num_points
+    names = {}
+    columns = []
     rigs = problem.rigs
     free = np.zeros(6, bool) if rigs.free is None else rigs.free
 
@@ -122,7 +122,8 @@ def copies_of(problem: BundleProblem) -> tuple[dict, np.ndarray]:
             lens = camera if problem.lenses is None else int(problem.lenses.index[camera])
             column(("lens", lens, k))[9 * camera + k] = 1
         for k in range(3 if free[camera] else 0):
-            start, axis = 9 * camera, np.eye(3)[k]
+            start = 9 * camera
+            axis = np.eye(3)[k]
             column(("place", int(problem.lenses.index[camera]), k))[start + k] = 1
             turned = np.cross(axis, problem.cameras[camera, 3:6] - rigs.translation[camera])
             column(("place", int(problem.lenses.index[camera]), k))[start + 3 : start + 6] = turned
@@ -134,7 +135,8 @@ def copies_of(problem: BundleProblem) -> tuple[dict, np.ndarray]:
 
 def unknown_step(problem: BundleProblem, names: dict, before, after) -> np.ndarray:
     """The step of each unknown between two states."""
-    old, new = np.array(before.cameras).T, np.array(after.cameras).T
+    old = np.array(before.cameras).T
+    new = np.array(after.cameras).T
     change = new - old
     for at in (0, 9):
         turned = (
@@ -260,7 +262,8 @@ def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera(make):
 
 @pytest.mark.slow
 def test_priors_are_of_cameras_and_not_of_their_frames():
-    problem, rng = stereo(), np.random.default_rng(2)
+    problem = stereo()
+    rng = np.random.default_rng(2)
     centers = geometry.camera_centers(problem.cameras) + 0.2 * rng.normal(size=(6, 3))
     known = with_position_priors(problem, centers, np.diag([0.01, 0.02, 0.03]), align=False)
     turned = problem.cameras[:, :3] + 0.05 * rng.normal(size=(6, 3))
@@ -279,10 +282,8 @@ def test_priors_are_of_cameras_and_not_of_their_frames():
     here = in_frames(found.problem)
     for _ in range(20):
         moved = np.array(here.cameras)
-        by_frame, by_lens = (
-            1e-4 * rng.normal(size=(4, 6)),
-            1e-4 * rng.normal(size=(2, 6)) * [[0], [1]],
-        )
+        by_frame = 1e-4 * rng.normal(size=(4, 6))
+        by_lens = 1e-4 * rng.normal(size=(2, 6)) * [[0], [1]]
         moved[:, :6] += by_frame[FRAME]
         moved[:, -6:] += by_lens[problem.lenses.index]
         cameras, rigs = out_of_frames(found.problem, moved)
@@ -336,7 +337,9 @@ def one_sensor() -> BundleProblem:
 
 @pytest.mark.slow
 def test_what_is_measured_of_a_camera_without_pixels_moves_its_frame():
-    problem, images, seen = one_sensor(), [2, 4, 3, 5], [0, 1, 3, 5]
+    problem = one_sensor()
+    images = [2, 4, 3, 5]
+    seen = [0, 1, 3, 5]
     measured = geometry.camera_centers(problem.cameras)[images] + np.random.default_rng(0).normal(
         size=(4, 3)
     )
@@ -346,7 +349,8 @@ def test_what_is_measured_of_a_camera_without_pixels_moves_its_frame():
     after = found.problem
     BundleProblem.create(after.cameras, *support.arrays(after)[1:], rigs=after.rigs)
     # as if the cameras with pixels had the measurements, by lever arms in COLMAP's axes
-    turn, place = np.asarray(problem.rigs.rotation), np.asarray(problem.rigs.translation)
+    turn = np.asarray(problem.rigs.rotation)
+    place = np.asarray(problem.rigs.translation)
     arms = place[seen] - np.einsum("nij,nkj,nk->ni", turn[seen], turn[images], place[images])
     rows = residuals.position(
         pose=seen, position=measured, lever_arm=arms * [1, -1, -1], whitening=10 * np.eye(3)

@@ -97,10 +97,8 @@ def test_small_systems_are_solved_as_lapack_solves_them(seed, decades):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(7, 9, 12))
     scale = 10.0 ** rng.uniform(-abs(decades), abs(decades), size=(7, 9, 1))
-    matrix, right = (
-        (scale * root) @ (scale * root).transpose(0, 2, 1),
-        scale[:, :, 0] * rng.normal(size=(7, 9)),
-    )
+    matrix = (scale * root) @ (scale * root).transpose(0, 2, 1)
+    right = scale[:, :, 0] * rng.normal(size=(7, 9))
     found = np.asarray(solve_positive(jnp.asarray(matrix), jnp.asarray(right)))
     expected = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
     # in the units of the scale, where the systems are well conditioned
@@ -129,14 +127,16 @@ def test_a_round_is_a_damped_gauss_newton_step_of_each_camera():
         before = camera_costs(problem)
         for camera in range(problem.num_cameras):
             own = slice(9 * camera, 9 * camera + 9)
-            block, gradient = jacobian[:, own].T @ jacobian[:, own], jacobian[:, own].T @ residual
+            block = jacobian[:, own].T @ jacobian[:, own]
+            gradient = jacobian[:, own].T @ residual
             expected = problem.cameras[camera]
             for damping in DAMPINGS:
                 change = np.zeros(jacobian.shape[1])
                 change[own] = -np.linalg.solve(block + damping * np.diag(np.diag(block)), gradient)
                 moved = support.moved(problem, manifold, change)
                 if camera_costs(moved)[camera] < before[camera]:
-                    expected, helped = moved.cameras[camera], helped + 1
+                    expected = moved.cameras[camera]
+                    helped = helped + 1
                     break
             np.testing.assert_allclose(after.cameras[camera], expected, rtol=1e-5, atol=1e-6)
     assert helped >= 12
@@ -144,10 +144,12 @@ def test_a_round_is_a_damped_gauss_newton_step_of_each_camera():
 
 def test_every_camera_ends_where_scipy_ends_on_that_camera_alone():
     problem = turned(6, 0.1)
-    once, found = camera_costs(resected(problem)), camera_costs(resected(problem, 40))
+    once = camera_costs(resected(problem))
+    found = camera_costs(resected(problem, 40))
     for camera in range(problem.num_cameras):
         own = problem.camera_index == camera
-        points, seen = problem.points[problem.point_index[own]], problem.observations[own]
+        points = problem.points[problem.point_index[own]]
+        seen = problem.observations[own]
 
         def residuals(x: np.ndarray, points=points, seen=seen) -> np.ndarray:
             local = points @ geometry.rotation_matrices(x[None, :3])[0].T + x[3:6]
@@ -196,7 +198,8 @@ def test_without_embedded_iterations_the_candidate_is_the_step_and_nothing_else(
 
 
 def test_the_promise_at_a_share_of_the_step_is_the_quadratic_model_there():
-    problem, damping = turned(1, 0.3), 1e-3
+    problem = turned(1, 0.3)
+    damping = 1e-3
     layout, before = start(problem)
     linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
     found = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(damping), PLAIN)
@@ -207,7 +210,8 @@ def test_the_promise_at_a_share_of_the_step_is_the_quadratic_model_there():
         np.testing.assert_allclose(found.predicted(jnp.asarray(share)), model, rtol=1e-7)
 
 
-KIND, SCENES = SceneClass(5, 12), 80
+KIND = SceneClass(5, 12)
+SCENES = 80
 
 
 @functools.cache
@@ -253,10 +257,8 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         assert power in (1, 2, 3)
         costs = []
         for share in SHORTER ** np.arange(power + 1.0):
-            cameras, points = (
-                before.cameras + share * whole.cameras,
-                before.points + share * whole.points,
-            )
+            cameras = before.cameras + share * whole.cameras
+            points = before.points + share * whole.points
             costs.append(float(_cost(layout, cameras, points, PLAIN.loss)))
         assert not min(costs[:-1]) < before.cost  # no longer share would have done
         np.testing.assert_allclose(after.cameras, cameras, rtol=1e-9, atol=1e-9)
@@ -279,10 +281,12 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
     whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(1e-3), PLAIN)
     mirrored = whole._replace(cameras=whole.cameras.at[6, 0].set(-1.5 * before.cameras[6, 0]))
-    found = lambda options: _best_candidate(
-        layout, *before[:3], linear.reference, mirrored, options, 0.0
-    )
-    plain, kept = found(PLAIN), found(SHORTER_ONLY)
+
+    def found(options):
+        return _best_candidate(layout, *before[:3], linear.reference, mirrored, options, 0.0)
+
+    plain = found(PLAIN)
+    kept = found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
     assert not plain.accepted
     assert kept.step_fraction == 1

@@ -72,7 +72,8 @@ def in_layout(problem: BundleProblem, points: np.ndarray) -> np.ndarray:
 
 def nearest_to_rays(problem: BundleProblem, point: int) -> np.ndarray:
     """Least squares over a point's rays by NumPy, each undistorted by a root search."""
-    rows, right = [], []
+    rows = []
+    right = []
     for k in np.flatnonzero(problem.point_index == point):
         camera = np.asarray(problem.cameras)[problem.camera_index[k]]
         pixel = np.asarray(problem.observations)[k]
@@ -121,8 +122,10 @@ def point_costs(problem: BundleProblem) -> np.ndarray:
     "make", [lambda: thrown(2, 3.0), lambda: strayed(-1.0), lambda: strayed(1e4)]
 )
 def test_a_start_costs_no_more_than_where_the_step_went_and_is_behind_no_camera(make):
-    home, gone = solved(), make()
-    layout, cameras = build_layout(home), np.asarray(home.cameras).T
+    home = solved()
+    gone = make()
+    layout = build_layout(home)
+    cameras = np.asarray(home.cameras).T
     args = cameras, in_layout(home, home.points), in_layout(home, gone.points)
     found = np.asarray(_starts(layout, *args, LOSS)[0])
     real, order = order_of(home)
@@ -130,7 +133,8 @@ def test_a_start_costs_no_more_than_where_the_step_went_and_is_behind_no_camera(
     points[order] = found[:, real].T
     after = home.replace(points=points)
     behind = np.bincount(gone.point_index, geometry.depths(gone) < 0, minlength=gone.num_points) > 0
-    before, now = point_costs(gone), point_costs(after)
+    before = point_costs(gone)
+    now = point_costs(after)
     assert (now[~behind] <= before[~behind] * (1 + 1e-12)).all()
     assert (geometry.depths(after) > 0).all()  # as at home
     moved = np.any(points != gone.points, axis=1)
@@ -151,7 +155,8 @@ def test_where_the_step_was_right_nothing_is_moved():
 
 def wrong(seed: int, size: float) -> tuple[BundleProblem, np.ndarray]:
     """Wrong matches, which give points several minima, and places far from where they are."""
-    home, rng = solved(), np.random.default_rng(seed)
+    home = solved()
+    rng = np.random.default_rng(seed)
     pixels = np.array(home.observations)
     some = rng.random(len(pixels)) < 0.3
     pixels[some] += 300 * rng.normal(size=(some.sum(), 2))
@@ -194,10 +199,8 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     home, points = wrong(2, 3.0)
     problem = home.replace(points=points)
     args = build_layout(home), np.asarray(home.cameras).T, *[in_layout(home, points)] * 2
-    options, damping = (
-        StepOptions(refinement=Refinement(points=3, starts="rays")),
-        jnp.asarray(1e12),
-    )
+    options = StepOptions(refinement=Refinement(points=3, starts="rays"))
+    damping = jnp.asarray(1e12)
     costs = {}
     for limit, both in ((acceptance.NEAR_CONVERGENCE, True), (0.0, False)):
         monkeypatch.setattr(acceptance, "NEAR_CONVERGENCE", limit)
@@ -216,7 +219,8 @@ def test_only_the_whole_step_asks_for_the_rays():
     start = strayed(1e4)
     layout = build_layout(start)
     state = initial_state(layout, start, StepOptions())
-    damping, costs = jnp.asarray(1.0), {}
+    damping = jnp.asarray(1.0)
+    costs = {}
     for trials in (1, 2):
         options = StepOptions(refinement=Refinement(points=3, starts="rays", trials=trials))
         once = jax.jit(
@@ -232,7 +236,8 @@ def test_only_the_whole_step_asks_for_the_rays():
 
 @pytest.mark.slow
 def test_points_that_lie_far_away_come_back_in_four_iterations_where_their_rays_are_asked():
-    start, best = strayed(30.0), geometry.cost(solved())
+    start = strayed(30.0)
+    best = geometry.cost(solved())
     step = StepOptions(refinement=Refinement(points=3))
     rays = StepOptions(refinement=Refinement(points=3, starts="rays"))
     found = solve(start, "gauss-newton", rays, max_iterations=4)

@@ -80,15 +80,17 @@ def test_more_iterations_never_cost_more():
 
 def test_points_take_no_further_step_after_one_that_brought_no_more_than_enough():
     layout, state = start(support.tiny())
-    frames, loss = slot_frames(layout, state.cameras), Loss()
+    frames = slot_frames(layout, state.cameras)
+    loss = Loss()
     refine = jax.jit(
         lambda points, iterations, enough: refine_points(
             layout, state.cameras, frames, points, loss, iterations, None, enough
         )
     )
-    total = lambda iterations, enough=-np.inf: float(
-        np.sum(refine(state.points, iterations, enough)[1])
-    )
+
+    def total(iterations, enough=-np.inf):
+        return float(np.sum(refine(state.points, iterations, enough)[1]))
+
     totals = [total(k) for k in range(5)]
     brought = -np.diff(totals)
     assert (brought[:3] > 0).all()
@@ -117,7 +119,8 @@ def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
     rotations = geometry.rotation_matrices(problem.cameras[:, :3])
     for point in range(problem.num_points):
         own = problem.point_index == point
-        cameras, seen = problem.camera_index[own], problem.observations[own]
+        cameras = problem.camera_index[own]
+        seen = problem.observations[own]
 
         def residuals(x: np.ndarray, cameras=cameras, seen=seen) -> np.ndarray:
             local = rotations[cameras] @ x + problem.cameras[cameras, 3:6]
@@ -220,7 +223,8 @@ def _refined_after(layout, state, points, loss, iterations):
 
 
 def test_points_that_a_step_sent_behind_a_camera_start_again_from_previous():
-    problem, lost = support.tiny(), np.arange(0, 40, 3)
+    problem = support.tiny()
+    lost = np.arange(0, 40, 3)
     layout, state = start(problem)
     assert (depths(problem) > 0).all()
     elsewhere = mirrored(problem, lost)
@@ -233,7 +237,8 @@ def test_points_that_a_step_sent_behind_a_camera_start_again_from_previous():
 
 
 def test_points_that_the_step_left_in_front_do_not_start_from_previous():
-    problem, lost = support.tiny(), np.arange(0, 40, 3)
+    problem = support.tiny()
+    lost = np.arange(0, 40, 3)
     layout, state = start(problem)
     moved = problem.replace(points=np.array(problem.points) + 0.3)
     _, there = start(moved)
@@ -262,7 +267,8 @@ def parallel(seed: int) -> BundleProblem:
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(-2, 2, (60, 2)), rng.uniform(-12, -8, 60)])
     cameras = [[0, 0, 0, shift, 0, 0, 500.0, 0, 0] for shift in (0.0, 0.1)]
-    camera, point = np.tile([0, 1], 60), np.repeat(np.arange(60), 2)
+    camera = np.tile([0, 1], 60)
+    point = np.repeat(np.arange(60), 2)
     local = points[point] + np.array(cameras)[camera, 3:6]
     pixels = -500 * local[:, :2] / local[:, 2:] + rng.normal(scale=5, size=(120, 2))
     return BundleProblem.create(cameras, points, pixels, camera, point)
@@ -282,13 +288,15 @@ def settled(problem: BundleProblem, iterations: int) -> BundleProblem:
 @pytest.mark.parametrize("iterations", [1, 3, 10])
 def test_no_point_goes_a_hundred_times_as_far_in_one_go_nor_beyond_infinity(iterations):
     problem = parallel(0)
-    before, after = nearness(problem), nearness(settled(problem, iterations))
+    before = nearness(problem)
+    after = nearness(settled(problem, iterations))
     assert (after >= before / MAX_DISTANCE_RATIO * (1 - 1e-9)).all()
 
 
 def test_points_whose_rays_meet_far_away_come_near_to_them_iteration_by_iteration():
     """What stops a point is no wall: the next iteration goes on."""
-    problem, distance = parallel(0), []
+    problem = parallel(0)
+    distance = []
     for _ in range(4):
         distance.append(np.max(1 / nearness(problem)))
         problem = settled(problem, 10)

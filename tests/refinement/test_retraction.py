@@ -41,9 +41,10 @@ def test_all_lens_steps_agree_to_first_order(rotation):
     first = []
     for lens_step in ("file", "pixels"):
         options = StepOptions(coordinates=Coordinates(rotation=rotation, lens_step=lens_step))
-        along = lambda size, options=options: move_cameras(
-            layout, jnp.asarray(cameras), size * step, options
-        )
+
+        def along(size, options=options):
+            return move_cameras(layout, jnp.asarray(cameras), size * step, options)
+
         first.append(jax.jvp(along, (0.0,), (1.0,)))
     (start, slope), (other_start, other_slope) = first
     np.testing.assert_allclose(other_slope, slope, rtol=1e-12, atol=1e-12)
@@ -75,9 +76,10 @@ def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
     local = np.column_stack([rng.normal(size=(20, 2)), -rng.uniform(2, 9, size=20)])
     turn = Rotation.from_rotvec([0.3, -0.2, 0.9])
     camera = np.array([*turn.as_rotvec(), 0.1, 0.2, 0.3, 500.0, 0.15, -0.08])
-    seen = lambda camera, local: support.distort(
-        -local[:, :2] / local[:, 2:], np.tile(camera[6:], (20, 1))
-    )
+
+    def seen(camera, local):
+        return support.distort(-local[:, :2] / local[:, 2:], np.tile(camera[6:], (20, 1)))
+
     step = np.zeros((9, 1))
     step[6:, 0] = camera[6] * growth, 2 * camera[7] * growth, 4 * camera[8] * growth
     points = turn.inv().apply(local - camera[3:6])
@@ -106,7 +108,8 @@ def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
 
 def test_far_from_where_it_is_linear_a_lens_is_added_as_it_is():
     cameras, step = random_step(2, 0.1)
-    near, far = 0.9 * MAX_FOCAL_CHANGE, 1.1 * MAX_FOCAL_CHANGE
+    near = 0.9 * MAX_FOCAL_CHANGE
+    far = 1.1 * MAX_FOCAL_CHANGE
     step[6] = cameras[6] * np.array([near, -near, far, -far, 50.0, -2.0])
     moved, plain = (
         np.asarray(_move(build_layout(support.tiny()), cameras, step, how))
@@ -129,7 +132,8 @@ def test_a_camera_without_focal_length_stays_finite():
 
 
 def test_what_of_a_lens_stays_is_not_touched_by_a_zoom():
-    problem, (cameras, step) = support.tiny(), random_step(4, 0.1)
+    problem = support.tiny()
+    (cameras, step) = random_step(4, 0.1)
     held = np.array([[True, False, True], [True, True, False], [True, False, False]])
     lenses = Lenses(np.arange(problem.num_cameras) % 3, held)
     step[7, [0, 2, 3, 5]] = 0  # as the linear model has it

@@ -49,7 +49,8 @@ def data(problem: jaxba.BundleProblem) -> tuple[list[list[int]], dict[str, np.nd
 
 
 def test_control_points_are_rows_of_points_by_id(said):
-    places, stddev = "{103: [1, 2, 3], 7: [0, 0, 0], 129: [4, 5, 6]}", "[0.5, 1, [1, 2, 4]]"
+    places = "{103: [1, 2, 3], 7: [0, 0, 0], 129: [4, 5, 6]}"
+    stddev = "[0.5, 1, [1, 2, 4]]"
     text = f"control_points: {{positions: {places}, stddev: {stddev}, loss: huber}}\n"
     with pytest.warns(
         ProblemWarning, match=r"c.yaml: control_points: left out positions of 1 point that .*: 7"
@@ -111,10 +112,14 @@ def test_relative_poses_have_quaternions_or_angle_axis_vectors(said):
 def test_depth_maps_are_looked_up_at_pixels_and_find_their_scales(model, problem, tmp_path):
     """Maps with twice the depth and a half; one image has none, and one pixel of another has no
     depth."""
-    width, height, scale, shift = 900, 700, 2.0, 0.5
+    width = 900
+    height = 700
+    scale = 2.0
+    shift = 0.5
     if model == "SIMPLE_PINHOLE":
         cameras = np.hstack([problem.cameras[:, :7], np.tile([width / 2, height / 2], (5, 1))])
-        kinds, free = (CAMERA_MODELS[model],), np.zeros((5, 3), bool)
+        kinds = (CAMERA_MODELS[model],)
+        free = np.zeros((5, 3), bool)
         problem = problem.replace(
             cameras=cameras, lenses=jaxba.Lenses(np.arange(5, dtype=np.int32), free, None, kinds)
         )

@@ -36,7 +36,8 @@ def velocity(t) -> np.ndarray:
 
 def samples(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, angular rates and specific forces, without noise or bias."""
-    t, h = np.arange(0, 1.5, 1 / rate), 1e-4
+    t = np.arange(0, 1.5, 1 / rate)
+    h = 1e-4
     rates = (attitude(t - h).inv() * attitude(t + h)).as_rotvec() / (2 * h)
     force = (velocity(t + h) - velocity(t - h)) / (2 * h) - GRAVITY
     return t, rates, attitude(t).inv().apply(force)
@@ -48,7 +49,9 @@ def test_an_interval_is_that_of_fine_integration():
     start, end = MOMENTS[1:3]
 
     def rate(time, state):
-        now = lambda x: np.array([np.interp(time, t, column) for column in x.T])
+        def now(x):
+            return np.array([np.interp(time, t, column) for column in x.T])
+
         rotation = state[:9].reshape(3, 3)
         turn = np.cross(np.eye(3), now(rates) - BIAS[:3])
         return np.concatenate(
@@ -72,8 +75,12 @@ def test_an_interval_is_that_of_fine_integration():
 
 def test_derivatives_by_the_biases_are_those_of_differences():
     t, rates, forces = samples(200.0)
-    at = lambda bias: residuals.preintegrated(t, rates, forces, MOMENTS, bias=bias, noise=NOISE)
-    here, step = at(BIAS), 1e-5
+
+    def at(bias):
+        return residuals.preintegrated(t, rates, forces, MOMENTS, bias=bias, noise=NOISE)
+
+    here = at(BIAS)
+    step = 1e-5
     for k in range(6):
         one, other = (at(BIAS + sign * step * np.eye(6)[k]) for sign in (1, -1))
         turn = Rotation.from_matrix(here["rotation"]).inv()
@@ -91,11 +98,17 @@ def test_the_covariance_is_that_of_the_recursion_of_the_paper():
     """Forster et al. 2017, appendix: eqs. A.7 to A.9, by Euler's rule with short steps."""
     t, rates, forces = samples(2000.0)
     found = residuals.preintegrated(t, rates, forces, [t[0], t[600]], noise=NOISE)["whitening"][0]
-    cross = lambda v: geometry.cross_matrices(v[None])[0]
-    covariance, rotation, dt = np.zeros((9, 9)), np.eye(3), 1 / 2000.0
+
+    def cross(v):
+        return geometry.cross_matrices(v[None])[0]
+
+    covariance = np.zeros((9, 9))
+    rotation = np.eye(3)
+    dt = 1 / 2000.0
     for rate, force in zip(rates[:600], forces[:600], strict=True):
         turn = Rotation.from_rotvec(rate * dt).as_matrix()
-        a, b = np.eye(9), np.zeros((9, 6))
+        a = np.eye(9)
+        b = np.zeros((9, 6))
         a[:3, :3], a[6:, 3:6] = turn.T, np.eye(3) * dt
         a[3:6, :3], a[6:, :3] = (
             -rotation @ cross(force) * dt,
@@ -121,14 +134,16 @@ def test_a_solve_finds_poses_velocities_and_biases():
     cameras = np.hstack([geometry.angle_axis(bal), geometry.translations(bal, center), lens])
     local = rng.uniform([-2, -2, 4], [2, 2, 8], (40, 3))
     points = local @ rotation[2] + center[2]
-    camera, point = np.repeat(np.arange(5), 40), np.tile(np.arange(40), 5)
+    camera = np.repeat(np.arange(5), 40)
+    point = np.tile(np.arange(40), 5)
     truth = jaxba.BundleProblem.create(cameras, points, np.zeros((200, 2)), camera, point)
     truth = truth.replace(observations=geometry.project(truth))
     t, rates, forces = samples(500.0)
     given = residuals.preintegrated(
         t, rates + BIAS[:3], forces + BIAS[3:], MOMENTS, bias=BIAS + 1e-3, noise=NOISE
     )
-    one, two = np.arange(4), np.arange(1, 5)
+    one = np.arange(4)
+    two = np.arange(1, 5)
     rows = residuals.imu(
         pose=one,
         motion=one,
@@ -166,7 +181,8 @@ def test_a_stiff_chain_of_inertial_states_ends_at_the_truth_in_a_handful_of_iter
 
     It is the situation of GTSAM's ImuFactorExample, which takes 5 iterations."""
     rng = np.random.default_rng(0)
-    seconds, rate = 12, 100
+    seconds = 12
+    rate = 100
     spin = np.radians([30.0, -30.0, 0.0])  # in the body's frame, as its velocity
     speed = np.array([2.0, 0.0, 0.0])
     t = np.arange(seconds * rate + 1) / rate

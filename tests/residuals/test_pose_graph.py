@@ -37,7 +37,8 @@ def graph() -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
 def between(poses: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The poses of second cameras in the frames of first ones."""
     rotation = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    one, two = rotation[pairs[:, 0]], rotation[pairs[:, 1]]
+    one = rotation[pairs[:, 0]]
+    two = rotation[pairs[:, 1]]
     turn = one @ two.transpose(0, 2, 1)
     return turn, poses[pairs[:, 0], 3:] - np.einsum("nij,nj->ni", turn, poses[pairs[:, 1], 3:])
 
@@ -78,7 +79,8 @@ def test_a_pose_graph_ends_where_scipy_does():
         """`Log(T_measured^-1 T)` of SE(3), by the exponential of its matrix."""
         turn, move = between(np.vstack([poses[:1], free.reshape(-1, 6)]), pairs)
         back = measured["rotation"].transpose(0, 2, 1)
-        turn, move = back @ turn, np.einsum("nij,nj->ni", back, move - measured["translation"])
+        turn = back @ turn
+        move = np.einsum("nij,nj->ni", back, move - measured["translation"])
         axis = Rotation.from_matrix(turn).as_rotvec()
         angle = np.linalg.norm(axis, axis=1)[:, None]
         cross = np.cross(axis, move)

@@ -18,7 +18,9 @@ from jaxba.problem.residuals import Residuals
 from jaxba.problem.row_value import Lens, Pose
 from jaxba.scenes import SceneConfig
 
-UP, NORTH, EAST = np.array([0.0, 0.0, 2.0]), np.array([0.0, 3.0, 1.0]), np.array([1.0, 0.0, 0.0])
+UP = np.array([0.0, 0.0, 2.0])
+NORTH = np.array([0.0, 3.0, 1.0])
+EAST = np.array([1.0, 0.0, 0.0])
 
 
 def scene() -> jaxba.BundleProblem:
@@ -72,15 +74,19 @@ def solved(problem: jaxba.BundleProblem, iterations: int = 60) -> jaxba.BundlePr
 
 def test_a_relative_pose_is_the_logarithm_of_the_measured_motion_undone():
     rng = np.random.default_rng(0)
-    one, two = random_pose(rng), random_pose(rng)
+    one = random_pose(rng)
+    two = random_pose(rng)
     between = np.linalg.inv(to_world(one)) @ to_world(two)
     measured = between @ expm(
         np.array([[0, -0.3, 0.5, 1], [0.3, 0, 0.9, -2], [-0.5, -0.9, 0, 0.4], [0, 0, 0, 0]])
     )
     whitening = rng.standard_normal((6, 6))
-    of = lambda m: residuals.relative_pose.function(
-        one, two, rotation=m[:3, :3], translation=m[:3, 3], whitening=whitening
-    )
+
+    def of(m):
+        return residuals.relative_pose.function(
+            one, two, rotation=m[:3, :3], translation=m[:3, 3], whitening=whitening
+        )
+
     error = np.real(np.asarray(logm(np.linalg.inv(measured) @ between)))
     expected = np.array([error[2, 1], error[0, 2], error[1, 0], *error[:3, 3]])
     np.testing.assert_allclose(of(measured), whitening @ expected, atol=1e-12)
@@ -91,7 +97,8 @@ def test_inclinometer_and_compass_measure_angles():
     """A camera that looks 40 degrees east of north and 20 degrees up, rolled."""
     rng = np.random.default_rng(1)
     azimuth, tilt = np.deg2rad([40.0, 20.0])
-    north, up = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    north = np.array([0.0, 1.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
     forward = np.cos(tilt) * (np.cos(azimuth) * north + np.sin(azimuth) * EAST) + np.sin(tilt) * up
     right = np.cross(forward, up) / np.cos(tilt)
     level = np.stack([right, np.cross(forward, right), forward])
@@ -99,9 +106,10 @@ def test_inclinometer_and_compass_measure_angles():
         jnp.asarray(Rotation.from_rotvec([0, 0, 0.3]).as_matrix() @ level),
         jnp.asarray(rng.standard_normal(3)),
     )
-    of = lambda azimuth: residuals.heading.function(
-        pose, azimuth=azimuth, north=NORTH, up=UP, sigma=0.1
-    )
+
+    def of(azimuth):
+        return residuals.heading.function(pose, azimuth=azimuth, north=NORTH, up=UP, sigma=0.1)
+
     assert of(azimuth) == pytest.approx(0, abs=1e-12)
     assert of(azimuth - 0.02) == pytest.approx(0.2)
     assert of(azimuth + 2 * np.pi - 0.02) == pytest.approx(0.2)
@@ -109,7 +117,10 @@ def test_inclinometer_and_compass_measure_angles():
     turned = Rotation.from_rotvec(
         0.01 * np.cross(measured, [1, 0, 0]) / np.linalg.norm(np.cross(measured, [1, 0, 0]))
     )
-    of = lambda direction: residuals.gravity.function(pose, direction=direction, up=UP, sigma=0.1)
+
+    def of(direction):
+        return residuals.gravity.function(pose, direction=direction, up=UP, sigma=0.1)
+
     np.testing.assert_allclose(of(measured), 0, atol=1e-12)
     assert np.linalg.norm(of(turned.apply(measured))) == pytest.approx(0.1, rel=1e-4)
 
@@ -118,11 +129,13 @@ def test_inclinometer_and_compass_measure_angles():
 def test_a_survey_finds_the_scene_from_points_antennas_baselines_and_planes():
     """Without pixels that say anything about position, orientation and scale of the whole."""
     truth, start = truth_and_start(0.005)
-    poses, each = poses_of(truth), np.arange(5)
+    poses = poses_of(truth)
+    each = np.arange(5)
     arm = np.array([0.1, -0.2, 0.3])
     antennas = np.array([to_world(pose)[:3, :3] @ arm + to_world(pose)[:3, 3] for pose in poses])
     up = np.array([pose.rotation @ UP for pose in poses])
-    first, second = poses[0], poses[1]
+    first = poses[0]
+    second = poses[1]
     z = np.linalg.inv(to_world(first)) @ to_world(second)
     forward = np.array([pose.rotation[2] for pose in poses])
     azimuth = np.arctan2(forward[:, 0], forward[:, 1])
@@ -150,8 +163,11 @@ def test_a_survey_finds_the_scene_from_points_antennas_baselines_and_planes():
             sigma=np.full(10, 0.01),
         ),
     )
+
     # without the checks of with_residual
-    indexed = lambda rows: tuple(x.astype(np.int32) for x in rows.index)
+    def indexed(rows):
+        return tuple(x.astype(np.int32) for x in rows.index)
+
     rows = [
         replace(x, size=n, index=indexed(x))
         for x, n in zip(every, (3, 3, 3, 1, 1, 6, 1), strict=True)
@@ -166,8 +182,10 @@ def test_depth_maps_find_points_and_their_own_scales():
     start = jaxba.hold(
         start.replace(cameras=truth.cameras), poses="all", numbers=["focal", "distortion"]
     )
-    camera, point = truth.camera_index, truth.point_index
-    scale, shift = np.linspace(0.5, 2.0, 5), np.linspace(-1.0, 1.0, 5)
+    camera = truth.camera_index
+    point = truth.point_index
+    scale = np.linspace(0.5, 2.0, 5)
+    shift = np.linspace(-1.0, 1.0, 5)
     measured = scale[camera] * geometry.depths(truth) + shift[camera]
     rows = residuals.depth(pose=camera, point=point, image=camera, measured=measured, sigma=0.1)
     found = solved(
@@ -180,7 +198,8 @@ def test_depth_maps_find_points_and_their_own_scales():
 
 
 def test_a_scale_bar_measures_the_distance_of_two_points():
-    one, two = np.array([1.0, 2.0, 3.0]), np.array([1.0, 5.0, 7.0])
+    one = np.array([1.0, 2.0, 3.0])
+    two = np.array([1.0, 5.0, 7.0])
     assert residuals.distance.function(one, two, length=4.5, sigma=0.1) == pytest.approx(5.0)
 
 
@@ -190,7 +209,8 @@ def test_a_rolling_shutter_moves_as_the_camera_does():
     truth, _ = truth_and_start()
     rng = np.random.default_rng(4)
     velocity = 0.3 * rng.standard_normal((5, 6))
-    time, steps = rng.uniform(-0.4, 0.4, truth.num_observations), 2000
+    time = rng.uniform(-0.4, 0.4, truth.num_observations)
+    steps = 2000
     # to the world
     rotation = np.array([pose.rotation.T for pose in poses_of(truth)])[truth.camera_index]
     small = Rotation.from_rotvec(
@@ -217,11 +237,17 @@ def test_a_rolling_shutter_moves_as_the_camera_does():
 
 
 def test_bounds_of_lenses_are_a_smooth_hinge_that_acts_everywhere():
-    lens = lambda *x: Lens(jnp.asarray(x), jnp.asarray(0), ())
-    low, high = np.array([400.0, -1.0, -1.0]), np.array([600.0, 1.0, 1.0])
-    of = lambda f: np.asarray(
-        residuals.lens_bounds.function(lens(f, 0.0, 0.0), low=low, high=high, sigma=2.0)
-    )
+    def lens(*x):
+        return Lens(jnp.asarray(x), jnp.asarray(0), ())
+
+    low = np.array([400.0, -1.0, -1.0])
+    high = np.array([600.0, 1.0, 1.0])
+
+    def of(f):
+        return np.asarray(
+            residuals.lens_bounds.function(lens(f, 0.0, 0.0), low=low, high=high, sigma=2.0)
+        )
+
     np.testing.assert_allclose(of(500.0)[[0, 3]], 1 / (2 * (50 + np.sqrt(2501))), rtol=1e-12)
     assert of(400.0)[0] == 0.5
     assert of(700.0)[3] == pytest.approx(50, rel=1e-3)

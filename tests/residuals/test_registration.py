@@ -85,9 +85,15 @@ def many(point, point_2):
 
 def refused():
     ones = {"at": 0.0, "sigma": 1.0}
-    of = lambda rows, **more: lambda p: jaxba.with_residual(p, rows, **more)
+
+    def of(rows, **more):
+        return lambda p: jaxba.with_residual(p, rows, **more)
+
     image = {"image": np.ones((CAMERAS, 2))}
-    depths = lambda **which: depth(measured=1.0, sigma=1.0, **which)
+
+    def depths(**which):
+        return depth(measured=1.0, sigma=1.0, **which)
+
     sensors = np.ones((2, 3))
     return {
         "no parameter": (lambda _: position(pose=0, at=0.0), "residual position needs sigma"),
@@ -201,7 +207,8 @@ def everything() -> jaxba.BundleProblem:
     problem = jaxba.with_residual(
         problem, position(pose=[0, 2], at=centers[[0, 2]] + 0.01, sigma=0.1)
     )
-    turn, shift = np.eye(3), np.array([1.0, 0.0, 0.0])
+    turn = np.eye(3)
+    shift = np.array([1.0, 0.0, 0.0])
     rows = relative_pose(pose=[0, 1], pose_2=[1, 2], turn=turn[None], shift=shift, sigma=2.0)
     problem = jaxba.with_residual(problem, rows, loss=jaxba.Loss("cauchy"))
     change = problem.points[[9, 5]] - problem.points[[0, 4]]
@@ -230,7 +237,8 @@ def test_rows_of_a_point_that_goes_go_and_the_others_stay():
     of = dict(
         zip(["depth", "position", "relative_pose", "apart"], kept.residuals.rows, strict=True)
     )
-    before, after = problem.residuals.rows[0].points[0], of["depth"].points[0]
+    before = problem.residuals.rows[0].points[0]
+    after = of["depth"].points[0]
     np.testing.assert_array_equal(kept.points[after], problem.points[before[before != 4]])
     np.testing.assert_array_equal([own[0] for own in of["apart"].points], [0, 8])
     assert len(of["apart"]) == 1
@@ -242,10 +250,16 @@ def test_derivatives_by_the_data_are_those_of_differences():
     tight = jaxba.SolveOptions(tolerances=jaxba.Tolerances(1e-15, 1e-15, 1e-15), max_iterations=200)
     solve = jaxba.differentiable_solve(problem, "ceres", tight)
     inputs = jax.tree.map(jnp.asarray, jaxba.inputs_of(problem))
-    value = lambda inputs: jnp.sum(solve(inputs)[1][::7])
+
+    def value(inputs):
+        return jnp.sum(solve(inputs)[1][::7])
+
     found = jax.grad(value)(inputs)
     (measured, sigma), *rest = inputs.residuals
-    at = lambda step: value(inputs._replace(residuals=((measured.at[5].add(step), sigma), *rest)))
+
+    def at(step):
+        return value(inputs._replace(residuals=((measured.at[5].add(step), sigma), *rest)))
+
     np.testing.assert_allclose(found.residuals[0][0][5], (at(1e-4) - at(-1e-4)) / 2e-4, rtol=5e-3)
 
 

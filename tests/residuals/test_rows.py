@@ -14,7 +14,8 @@ import jaxba
 from jaxba.problem import geometry
 from jaxba.scenes import SceneConfig, random_scene
 
-CAMERAS, POINTS = 5, 30
+CAMERAS = 5
+POINTS = 30
 AXES = np.diag([1.0, -1.0, -1.0])
 
 
@@ -74,7 +75,8 @@ def depths(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cameras, points and depths in one unit, of a third of the observations."""
     chosen = rng.permutation(problem.num_observations)[: problem.num_observations // 3]
-    camera, point = problem.camera_index[chosen], problem.point_index[chosen]
+    camera = problem.camera_index[chosen]
+    point = problem.point_index[chosen]
     rotation = geometry.rotation_matrices(problem.cameras[camera, :3])
     local = np.einsum("nij,nj->ni", rotation, problem.points[point]) + problem.cameras[camera, 3:6]
     return camera, point, -local[:, 2] * (1 + 0.05 * rng.standard_normal(len(chosen)))
@@ -109,19 +111,22 @@ KINDS = {
 def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
     """A problem with rows of a kind, and these residuals as a function of cameras, points and
     blocks."""
-    problem, rng = scene(), np.random.default_rng(1)
+    problem = scene()
+    rng = np.random.default_rng(1)
     centers = geometry.camera_centers(problem.cameras)
-    add, all_cameras = jaxba.with_residual, np.arange(CAMERAS)
-    center = lambda camera: -pose(camera)[0].T @ pose(camera)[1]
+    add = jaxba.with_residual
+    all_cameras = np.arange(CAMERAS)
+
+    def center(camera):
+        return -pose(camera)[0].T @ pose(camera)[1]
+
     if kind == "position":
         at = centers + 0.05 * rng.standard_normal(centers.shape)
         found = add(problem, position(pose=all_cameras, at=at, sigma=0.02))
         return found, lambda cameras, points, _: (jax.vmap(center)(cameras) - at) / 0.02
     if kind == "control":
-        which, at = (
-            np.arange(0, POINTS, 3),
-            problem.points[::3] + 0.03 * rng.standard_normal((POINTS // 3, 3)),
-        )
+        which = np.arange(0, POINTS, 3)
+        at = problem.points[::3] + 0.03 * rng.standard_normal((POINTS // 3, 3))
         sigma = np.linspace(0.01, 0.1, len(which))[:, None]
         found = add(problem, control_point(point=which, at=at, sigma=sigma))
         return found, lambda cameras, points, _: (points[which] - at) / sigma
@@ -133,7 +138,10 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
         start = np.tile([1.0, 0.0], (CAMERAS, 1))
         rows = depth(pose=camera, point=point, image=camera, measured=measured, sigma=0.1)
         found = add(problem, rows, unknowns={"image": start})
-        of = lambda c, x, b: b[0] * (pose(c)[0] @ x + pose(c)[1])[2] + b[1]
+
+        def of(c, x, b):
+            return b[0] * (pose(c)[0] @ x + pose(c)[1])[2] + b[1]
+
         return (
             found,
             lambda cameras, points, blocks: (
@@ -141,7 +149,8 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
             ),
         )
     if kind == "relative":
-        first, second = np.array([0, 1, 2, 4]), np.array([1, 2, 3, 0])
+        first = np.array([0, 1, 2, 4])
+        second = np.array([1, 2, 3, 0])
         truth = [pose(jnp.asarray(c)) for c in problem.cameras]
         turn = np.array(
             [np.asarray(truth[j][0] @ truth[i][0].T) for i, j in zip(first, second, strict=True)]
@@ -157,7 +166,8 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
         )
 
         def of(one, other, turn, shift):
-            (r1, t1), (r2, t2) = pose(one), pose(other)
+            (r1, t1) = pose(one)
+            (r2, t2) = pose(other)
             off = r2 @ r1.T @ turn.T
             axis = (
                 jnp.array([off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]) / 2
@@ -169,7 +179,8 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
             cameras[first], cameras[second], *given
         )
     if kind == "apart":
-        first, second = np.array([0, 3, 5, 5]), np.array([7, 8, 0, 9])
+        first = np.array([0, 3, 5, 5])
+        second = np.array([7, 8, 0, 9])
         change = problem.points[second] - problem.points[first]
         by = np.hstack(
             [np.linalg.norm(change, axis=1)[:, None], change]
@@ -181,7 +192,8 @@ def example(kind: str) -> tuple[jaxba.BundleProblem, object]:
             return jnp.hstack([jnp.sqrt(jnp.sum(change**2, axis=1))[:, None], change]) / 0.02 - by
 
         return found, of_points
-    first, second = np.arange(CAMERAS - 1), np.arange(1, CAMERAS)
+    first = np.arange(CAMERAS - 1)
+    second = np.arange(1, CAMERAS)
     measured = np.sum((centers[first] - centers[second]) ** 2, axis=1) * 1.1
     zero = np.zeros(CAMERAS - 1, int)
     rows = drift(pose=first, pose_2=second, clock=zero, clock_2=zero, measured=measured)
@@ -288,7 +300,8 @@ def start(state):
 
 
 def turned(state, state_2):
-    cos, sin = jnp.cos(state[2]), jnp.sin(state[2])
+    cos = jnp.cos(state[2])
+    sin = jnp.sin(state[2])
     return jnp.array([[cos, sin], [-sin, cos]]) @ (state_2[:2] - state[:2])
 
 
@@ -315,7 +328,8 @@ def test_a_robot_in_the_plane_is_one_block_of_states_and_landmarks():
     rows = odometry(state=[0, 1], state_2=[1, 2], move=[2.0, 0.0, 0.0])
     problem = jaxba.with_residual(problem, rows, unknowns={"state": off})
     problem = jaxba.with_residual(problem, start(state=0))
-    bearing, length = np.radians([45.0, 90.0, 90.0]), [np.sqrt(8), 2.0, 2.0]
+    bearing = np.radians([45.0, 90.0, 90.0])
+    length = [np.sqrt(8), 2.0, 2.0]
     rows = planar(state=[0, 1, 2], state_2=[3, 3, 4], bearing=bearing, distance=length)
     solution = jaxba.solve(jaxba.with_residual(problem, rows), "ceres")
     assert solution.final_cost < 1e-20

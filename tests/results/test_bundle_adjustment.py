@@ -19,7 +19,8 @@ pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install 
 
 pytestmark = pytest.mark.extra
 
-IMAGES, POINTS = 6, 60
+IMAGES = 6
+POINTS = 60
 DISPLACED = 5  # points
 TYPES = pycolmap.BundleAdjustmentTerminationType
 
@@ -96,7 +97,8 @@ def displaced(seed):
 @pytest.mark.filterwarnings("ignore:the reconstruction. deleted:jaxba.ProblemWarning")
 def test_displaced_points_come_back_and_views_behind_are_deleted_as_by_colmap():
     ours, true = displaced(1)
-    theirs, right = copy.deepcopy(ours), copy.deepcopy(ours)
+    theirs = copy.deepcopy(ours)
+    right = copy.deepcopy(ours)
     pycolmap.ObservationManager(right).filter_observations_with_negative_depth()
     assert right.compute_num_observations() < ours.compute_num_observations()
     for point in right.points3D:
@@ -187,7 +189,8 @@ def test_a_gauge_that_too_few_points_cannot_hold_is_left_out_as_by_colmap(start,
 
 
 def test_a_summary_speaks_as_pycolmaps(start):
-    theirs, ours = copy.deepcopy(start), copy.deepcopy(start)
+    theirs = copy.deepcopy(start)
+    ours = copy.deepcopy(start)
     config = configuration(start)
     expected = pycolmap.create_default_bundle_adjuster(quiet(), config, theirs).solve()
     summary = jaxba.create_default_bundle_adjuster(quiet(), config, ours).solve()
@@ -204,7 +207,8 @@ def test_a_summary_speaks_as_pycolmaps(start):
 
 def test_a_dictionary_means_what_pycolmap_makes_of_it(start):
     values = {"refine_focal_length": False, "ceres": {"solver_options": {"max_num_iterations": 2}}}
-    ours, same = copy.deepcopy(start), copy.deepcopy(start)
+    ours = copy.deepcopy(start)
+    same = copy.deepcopy(start)
     summary = jaxba.bundle_adjustment(ours, values)
     jaxba.bundle_adjustment(same, pycolmap.BundleAdjustmentOptions(values))
     assert numbers(ours) == numbers(same)
@@ -272,7 +276,8 @@ def test_a_time_limit_ends_the_solve(start, monkeypatch):
 
 
 def test_a_time_limit_below_the_set_up_leaves_the_start_as_in_colmap(start):
-    ours, theirs = copy.deepcopy(start), copy.deepcopy(start)
+    ours = copy.deepcopy(start)
+    theirs = copy.deepcopy(start)
     options = quiet(max_solver_time_in_seconds=1e-6)
     with pytest.warns(
         jaxba.ProblemWarning, match="the time limit was over before the first iteration"
@@ -327,7 +332,8 @@ def test_pose_priors_end_where_pycolmaps_do(start, loss):
     config = pycolmap.BundleAdjustmentConfig()
     for image in start.images:
         config.add_image(image)
-    ours, theirs = copy.deepcopy(start), copy.deepcopy(start)
+    ours = copy.deepcopy(start)
+    theirs = copy.deepcopy(start)
     ours.add_point3D(np.ones(3), pycolmap.Track())  # seen by nothing: it moves with the rest
     arguments = options, prior_options, config, priors
     pycolmap.create_pose_prior_bundle_adjuster(*arguments, theirs).solve()

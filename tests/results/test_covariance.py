@@ -25,8 +25,12 @@ def weak() -> BundleProblem:
     """Camera 4 has four observations, camera 5 a constant pose and one, point 7 one; nothing sees
     point 9."""
     problem = hold(with_gauge(solved(), "two-cameras"), poses=[5])
-    camera, point = problem.camera_index, problem.point_index
-    of_camera = lambda at: np.cumsum(camera == at) * (camera == at)
+    camera = problem.camera_index
+    point = problem.point_index
+
+    def of_camera(at):
+        return np.cumsum(camera == at) * (camera == at)
+
     kept = (of_camera(4) <= 4) & (of_camera(5) <= 1) & (point != 9)
     kept &= (point != 7) | (np.cumsum((point == 7) & kept) <= 1)
     return problem.replace(
@@ -63,7 +67,8 @@ def close(found: np.ndarray, wanted: np.ndarray) -> None:
 
 def test_what_is_determined_has_the_covariance_of_the_dense_pseudo_inverse():
     problem = weak()
-    points, cameras = 100 + np.arange(problem.num_points), 10 + np.arange(6)
+    points = 100 + np.arange(problem.num_points)
+    cameras = 10 + np.arange(6)
     labels = Labels(tuple(f"{k}.jpg" for k in range(6)), cameras, 20 + np.arange(6), points)
     note = r"NaN for a covariance: image 14 \(4.jpg\), camera 24 and 1 more, point 107"
     with pytest.warns(ProblemWarning, match=note):
@@ -105,13 +110,17 @@ def test_a_point_that_is_nearly_not_determined_changes_no_other_covariance():
         # a point at infinity says something of rotations alone: variances become smaller, by a
         # little
         assert (np.diagonal(found.points[others], axis1=1, axis2=2) > 0).all()
-        near = lambda x: np.diagonal(x, axis1=1, axis2=2)
+
+        def near(x):
+            return np.diagonal(x, axis1=1, axis2=2)
+
         assert (near(found.points[others]) <= near(wanted.points[others]) * (1 + 1e-6)).all()
         assert (near(found.poses) <= near(wanted.poses) * (1 + 1e-6)).all()
 
 
 def test_derivatives_that_overflow_are_one_line():
-    cameras, points = np.array(solved().cameras), np.array(solved().points)
+    cameras = np.array(solved().cameras)
+    points = np.array(solved().points)
     point = solved().point_index[solved().camera_index == 0][0]
     cameras[0, :6], points[point] = 0.0, [1.0, 1.0, -1e-70]  # nearly in the plane of a camera
     problem = hold(solved().replace(cameras=cameras, points=points), poses=[0, 1])

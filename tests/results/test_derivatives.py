@@ -28,7 +28,8 @@ def scene() -> jaxba.BundleProblem:
 def constrained() -> jaxba.BundleProblem:
     """One lens for all, a constant pose, a constant point and number, and measured positions of
     four cameras."""
-    plain, rng = scene(), np.random.default_rng(0)
+    plain = scene()
+    rng = np.random.default_rng(0)
     cameras = np.array(plain.cameras)
     cameras[:, 6:] = cameras[0, 6:]
     lenses = jaxba.Lenses(np.zeros(6, np.int32), np.ones((1, 3), bool))
@@ -44,11 +45,15 @@ def constrained() -> jaxba.BundleProblem:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [scene, constrained], ids=["free gauge", "constants and priors"])
 def test_compiled_and_mapped_derivatives_are_those_of_single_solves(make):
-    problem, rng = make(), np.random.default_rng(2)
+    problem = make()
+    rng = np.random.default_rng(2)
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
     solved = differentiable_solve(problem, "ceres", TIGHT)
     lenses = rng.normal(size=(6, 3)) * [1e-3, 1, 1]  # they are the same on an orbit of a free gauge
-    value = lambda pixels: jnp.sum(lenses * solved(inputs._replace(observations=pixels))[0][:, 6:])
+
+    def value(pixels):
+        return jnp.sum(lenses * solved(inputs._replace(observations=pixels))[0][:, 6:])
+
     pixels = inputs.observations + 0.1 * rng.normal(size=(3, *inputs.observations.shape))
     found = jax.jit(jax.vmap(jax.value_and_grad(value)))(pixels)
     for number, one in enumerate(pixels):
@@ -69,7 +74,8 @@ def test_compiled_and_mapped_derivatives_are_those_of_single_solves(make):
 def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_differences(
     linear_solver,
 ):
-    problem, rng = constrained(), np.random.default_rng(1)
+    problem = constrained()
+    rng = np.random.default_rng(1)
     problem = problem.replace(
         whitening=np.tile(np.array([[1.0, 0.3], [0.3, 0.8]]), (problem.num_observations, 1, 1))
     )
@@ -96,7 +102,10 @@ def test_derivatives_by_observations_weights_priors_and_constants_are_those_of_d
     }
     for name, change in steps.items():
         start = getattr(inputs, name)
-        at = lambda step, *pair: jax.tree.map(lambda x, d: x + step * d, *pair)
+
+        def at(step, *pair):
+            return jax.tree.map(lambda x, d: x + step * d, *pair)
+
         ends = [
             value("explicit", inputs._replace(**{name: at(step, start, change)}))
             for step in (1e-3, -1e-3)
@@ -116,7 +125,10 @@ def test_the_scale_of_a_loss_is_an_input_by_what_whitens():
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
     ((position, whitening),) = inputs.residuals
     eye = jnp.tile(jnp.eye(2), (problem.num_observations, 1, 1))
-    options = lambda scale: dataclasses.replace(TIGHT, loss=jaxba.Loss("cauchy", scale))
+
+    def options(scale):
+        return dataclasses.replace(TIGHT, loss=jaxba.Loss("cauchy", scale))
+
     solved = differentiable_solve(problem.replace(whitening=np.array(eye)), "ceres", options(1.0))
     weights = np.random.default_rng(3).normal(size=problem.cameras.shape) * [
         1,
@@ -159,11 +171,10 @@ def shared(problem: jaxba.BundleProblem) -> jaxba.BundleProblem:
 
 def in_rig(problem: jaxba.BundleProblem) -> jaxba.BundleProblem:
     """Cameras 0 and 1 in a frame: the lens of camera 1 has a place in the rig."""
-    matrices, moved = (
-        geometry.rotation_matrices(problem.cameras[:, :3]),
-        np.array(problem.cameras[:, 3:6]),
-    )
-    turn, place = np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3))
+    matrices = geometry.rotation_matrices(problem.cameras[:, :3])
+    moved = np.array(problem.cameras[:, 3:6])
+    turn = np.tile(np.eye(3), (5, 1, 1))
+    place = np.zeros((5, 3))
     turn[1] = matrices[1] @ matrices[0].T
     place[1] = moved[1] - turn[1] @ moved[0]
     return problem.replace(rigs=jaxba.Rigs(np.array([0, 0, 1, 2, 3], np.int32), turn, place))
@@ -204,9 +215,11 @@ def from_a_body(
 ) -> jaxba.BundleProblem:
     """A rig whose axes are those of no camera: camera 1 is `apart` times as far from camera 0 as it
     was."""
-    rig, cameras = in_rig(problem), np.array(problem.cameras)
+    rig = in_rig(problem)
+    cameras = np.array(problem.cameras)
     assert rig.rigs is not None
-    turn, place = rig.rigs.rotation, np.tile([0.2, -0.1, 0.3], (5, 1))
+    turn = rig.rigs.rotation
+    place = np.tile([0.2, -0.1, 0.3], (5, 1))
     centers = geometry.camera_centers(cameras)
     matrices = geometry.rotation_matrices(cameras[:, :3])
     cameras[1, 3:6] = -matrices[1] @ (centers[0] + apart * (centers[1] - centers[0]))
@@ -291,8 +304,13 @@ def invariants(cameras: jax.Array, points: jax.Array) -> jax.Array:
     """Numbers that no similarity changes: ratios of distances of points and of cameras, an angle,
     focal lengths."""
     rotation = jnp.moveaxis(rotations.rotation_matrix(cameras[:, :3].T), 2, 0)
-    center = lambda at: -rotation[at].T @ cameras[at, 3:6]
-    length = lambda x: jnp.sqrt(jnp.sum(x * x))
+
+    def center(at):
+        return -rotation[at].T @ cameras[at, 3:6]
+
+    def length(x):
+        return jnp.sqrt(jnp.sum(x * x))
+
     base = length(points[0] - points[11])
     turn = rotation[0] @ rotation[3].T
     ratios = length(points[2] - points[5]) / base, length(center(1) - points[4]) / base
@@ -316,14 +334,21 @@ def test_derivatives_of_invariants_are_those_of_differences_in_every_setting(nam
     problem = solution.problem
     find = differentiable_solve(problem, "ceres", options)
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
-    weights, step = np.array([1.0, -0.7, 0.5, 0.3, 0.8]), 0.04
-    value = lambda inputs: jnp.sum(weights * invariants(*find(inputs)))
+    weights = np.array([1.0, -0.7, 0.5, 0.3, 0.8])
+    step = 0.04
+
+    def value(inputs):
+        return jnp.sum(weights * invariants(*find(inputs)))
+
     found = jax.grad(value)(inputs)
     change = np.random.default_rng(2).normal(size=inputs.observations.shape)
+
     # central differences of fourth order
-    at = lambda scale: float(
-        value(inputs._replace(observations=inputs.observations + scale * step * change))
-    )
+    def at(scale):
+        return float(
+            value(inputs._replace(observations=inputs.observations + scale * step * change))
+        )
+
     wanted = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
     # a solve ends some sqrt(2 ftol cost) pixels from its minimum
     away = 3 * np.sqrt(2 * TIGHT.tolerances.ftol * solution.final_cost) / step + 1e-7

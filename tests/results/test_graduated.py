@@ -33,7 +33,8 @@ def with_wrong(
     problem: BundleProblem, share: float, seed: int = 0
 ) -> tuple[BundleProblem, np.ndarray]:
     """Random pixels in the place of some, and which."""
-    rng, pixels = np.random.default_rng(seed), problem.observations
+    rng = np.random.default_rng(seed)
+    pixels = problem.observations
     wrong = rng.random(len(pixels)) < share
     anywhere = rng.uniform(pixels.min(0), pixels.max(0), pixels.shape)
     return problem.replace(observations=np.where(wrong[:, None], anywhere, pixels)), wrong
@@ -41,17 +42,16 @@ def with_wrong(
 
 def with_images(problem: BundleProblem, how: str) -> BundleProblem:
     """Images that face the other way, or are anywhere."""
-    cameras, rng = np.array(problem.cameras), np.random.default_rng(7)
+    cameras = np.array(problem.cameras)
+    rng = np.random.default_rng(7)
     turns = geometry.rotation_matrices(cameras[:, :3])
     centers = geometry.camera_centers(cameras)
     for image in IMAGES:
         turn = np.diag([-1.0, 1.0, -1.0]) @ turns[image]
         center = centers[image]
         if how == "anywhere":
-            turn, center = (
-                Rotation.random(rng=rng).as_matrix(),
-                rng.normal(centers.mean(0), centers.std(0)),
-            )
+            turn = Rotation.random(rng=rng).as_matrix()
+            center = rng.normal(centers.mean(0), centers.std(0))
         cameras[image, :6] = *Rotation.from_matrix(turn).as_rotvec(), *(-turn @ center)
     return problem.replace(cameras=cameras)
 
@@ -97,7 +97,10 @@ def test_other_residuals_keep_their_weight():
     """Positions that were measured hold the scene, as in a solve without the wrong matches."""
     centers = geometry.camera_centers(scene().cameras)
     problem, wrong = with_wrong(scene(), 0.3)
-    measure = lambda one: jaxba.with_position_priors(one, centers, stddev=1e-3, align=False)
+
+    def measure(one):
+        return jaxba.with_position_priors(one, centers, stddev=1e-3, align=False)
+
     solution = solve_graduated(measure(problem), options=QUICK)
     assert solution.rejected is not None
     assert solution.rejected[wrong].all()

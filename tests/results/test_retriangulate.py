@@ -56,7 +56,8 @@ def test_points_behind_their_cameras_or_far_away_are_found_again(factor):
 def test_no_point_costs_more_and_what_did_not_move_keeps_every_bit(make, loss):
     problem = make()
     found = retriangulate(problem, loss)
-    before, after = point_costs(problem, loss), point_costs(found.problem, loss)
+    before = point_costs(problem, loss)
+    after = point_costs(found.problem, loss)
     moved = np.any(np.asarray(found.problem.points) != problem.points, axis=1)
     assert found.moved == moved.sum()
     assert (after[moved] < before[moved]).all()
@@ -64,7 +65,10 @@ def test_no_point_costs_more_and_what_did_not_move_keeps_every_bit(make, loss):
     np.testing.assert_allclose(
         [found.cost_before, found.cost_after], [before.sum(), after.sum()], rtol=1e-9
     )
-    hidden = lambda p: np.bincount(p.point_index, geometry.depths(p) < 0, minlength=p.num_points)
+
+    def hidden(p):
+        return np.bincount(p.point_index, geometry.depths(p) < 0, minlength=p.num_points)
+
     assert (hidden(found.problem) <= hidden(problem)).all()
 
 
@@ -94,19 +98,18 @@ def test_at_the_minimum_nothing_moves():
 
 
 def test_units_and_axes_of_the_scene_do_not_matter():
-    start, turn, scale, shift = (
-        strayed(-1.0),
-        Rotation.from_rotvec([0.3, -0.5, 0.2]),
-        250.0,
-        np.array([7.0, -3.0, 11.0]),
-    )
+    start = strayed(-1.0)
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2])
+    scale = 250.0
+    shift = np.array([7.0, -3.0, 11.0])
     cameras = np.array(start.cameras)
     rotation = Rotation.from_rotvec(cameras[:, :3]) * turn.inv()
     cameras[:, :3] = rotation.as_rotvec()
     cameras[:, 3:6] = scale * cameras[:, 3:6] - rotation.apply(shift)
     other = start.replace(cameras=cameras, points=scale * turn.apply(start.points) + shift)
     np.testing.assert_allclose(geometry.cost(other), geometry.cost(start), rtol=1e-9)
-    one, two = retriangulate(start), retriangulate(other)
+    one = retriangulate(start)
+    two = retriangulate(other)
     assert one.moved == two.moved > 0
     np.testing.assert_allclose(two.cost_after, one.cost_after, rtol=1e-6)
 
@@ -169,7 +172,8 @@ def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
 
 @pytest.mark.slow
 def test_turns_end_lower_than_the_solve_alone_and_count_through():
-    heard, searches = [], []
+    heard = []
+    searches = []
     alone = jaxba.solve(one_diverged(), "ceres", STRANDING)
     both = in_turns(callback=heard.append, on_search=searches.append)
     assert both.converged
@@ -217,7 +221,8 @@ def test_a_stop_by_the_callback_ends_all_of_it():
 
 
 def test_the_search_counts_the_loss_of_the_solve():
-    searches, loss = [], Loss("cauchy", 2.0)
+    searches = []
+    loss = Loss("cauchy", 2.0)
     found = solve_and_retriangulate(
         support.tiny(), "ceres", solve_options(loss=loss), on_search=searches.append
     )
@@ -229,7 +234,8 @@ def test_the_search_counts_the_loss_of_the_solve():
 
 def test_what_does_not_pay_is_dropped():
     """With a tolerance so wide that no search pays, the solve alone is what comes back."""
-    searches, wide = [], replace(STRANDING, tolerances=Tolerances(ftol=0.5))
+    searches = []
+    wide = replace(STRANDING, tolerances=Tolerances(ftol=0.5))
     both = in_turns(wide, on_search=searches.append)
     (search,) = searches
     assert search.moved > 0

@@ -66,7 +66,8 @@ def test_readers_see_the_old_file_until_the_new_one_is_whole(tmp_path):
 
 
 def test_links_and_permissions_stay(tmp_path):
-    path, link = tmp_path / "file", tmp_path / "link"
+    path = tmp_path / "file"
+    link = tmp_path / "link"
     path.write_bytes(b"old")
     path.chmod(0o640)
     link.symlink_to(path)

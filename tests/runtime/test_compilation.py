@@ -40,7 +40,8 @@ on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_more_observations_mean_fewer_quick_iterations(kind):
-    even, typical = BREAK_EVEN[kind], TYPICAL[kind]
+    even = BREAK_EVEN[kind]
+    typical = TYPICAL[kind]
     assert [quick_iterations(kind, count) for count in (1, 100, even // typical)] == [
         even,
         even // 100,
@@ -92,10 +93,14 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
     ids=str,
 )
 def test_every_program_is_compiled_once_before_the_first_iteration(how):
-    problem, late = random_scene(SceneConfig(7, 50, 250), 0), []
+    problem = random_scene(SceneConfig(7, 50, 250), 0)
+    late = []
     jax.clear_caches()
     with Compilations() as seen:
-        watch = lambda record: late.append(len(set(seen.names) - {"camera_round"}))
+
+        def watch(record):
+            return late.append(len(set(seen.names) - {"camera_round"}))
+
         solved = solve(problem, "bold", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
     assert late == [len(set(seen.names) - {"camera_round"})] * 4
@@ -138,11 +143,16 @@ def test_candidates_one_by_one_are_those_of_the_loop(level):
                 proposal._replace(step=step),
                 options,
             )
-            call = lambda function, *arguments: function(*arguments)
-            part = lambda function, *arguments: (
-                program(function, "options", level=level),
-                *arguments,
-            )
+
+            def call(function, *arguments):
+                return function(*arguments)
+
+            def part(function, *arguments):
+                return (
+                    program(function, "options", level=level),
+                    *arguments,
+                )
+
             parts = try_step_by_parts(call, part, *given, np.asarray(0.0))
             whole = jax.jit(try_step, static_argnums=4)(*given)
             chex.assert_trees_all_close(parts, whole, rtol=1e-7, atol=1e-10)

@@ -102,7 +102,9 @@ def call(x, power=1):
     ids=str,
 )
 def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how, folder):
-    once = lambda: solve(support.tiny(), **how, max_iterations=4, callback=lambda record: None)
+    def once():
+        return solve(support.tiny(), **how, max_iterations=4, callback=lambda record: None)
+
     first = once()
     count = len(kept(folder))
     assert count >= 5
@@ -148,7 +150,9 @@ def test_a_second_solve_in_parts_reads_its_programs_and_repeats_itself_bit_by_bi
 
 
 def test_nothing_that_is_read_can_run_code_of_its_own(folder, monkeypatch):
-    once = lambda: solve(support.tiny(), "ceres", max_iterations=2, callback=lambda record: None)
+    def once():
+        return solve(support.tiny(), "ceres", max_iterations=2, callback=lambda record: None)
+
     expected = once().history
     forget()
     for name in ("load", "loads", "Unpickler"):
@@ -166,7 +170,9 @@ def test_nothing_that_is_read_can_run_code_of_its_own(folder, monkeypatch):
 
 @pytest.mark.slow
 def test_a_problem_that_shares_some_programs_compiles_each_other_one_once(folder):
-    once = lambda problem: solve(problem, "ceres", max_iterations=2, callback=lambda record: None)
+    def once(problem):
+        return solve(problem, "ceres", max_iterations=2, callback=lambda record: None)
+
     once(support.tiny())
     forget()
     with Compilations() as seen:
@@ -208,12 +214,16 @@ def test_what_a_solve_ran_quickly_compiled_is_fully_optimised_in_the_next(folder
     """Another process compiles it after the solve; the second solve differs by rounding alone."""
     monkeypatch.setattr(stepwise, "WORTH_S", 0.0)
     problem = support.tiny()
-    once = lambda: solve(
-        problem, "ceres", max_iterations=4, compilation="auto", tolerances=Tolerances(ftol=0)
-    )
+
+    def once():
+        return solve(
+            problem, "ceres", max_iterations=4, compilation="auto", tolerances=Tolerances(ftol=0)
+        )
+
     first = once()
     assert first.quick_iterations == 4
-    before, limit = len(kept(folder)), time.monotonic() + 60
+    before = len(kept(folder))
+    limit = time.monotonic() + 60
     while len(kept(folder)) < before + 2 and time.monotonic() < limit:  # propose and try_step
         time.sleep(0.1)
     forget()
@@ -228,7 +238,8 @@ def test_what_a_solve_ran_quickly_compiled_is_fully_optimised_in_the_next(folder
 
 @pytest.mark.slow
 def test_a_second_call_of_the_command_traces_no_step_and_writes_the_same_file(tmp_path):
-    problem, folder = tmp_path / "tiny.txt", tmp_path / "cache"
+    problem = tmp_path / "tiny.txt"
+    folder = tmp_path / "cache"
     write_problem(support.tiny(), problem)
     ends = []
     for turn in range(2):
@@ -365,9 +376,12 @@ def test_a_users_residual_is_known_by_what_it_does(folder):
 
     known = [jitted(scale).residuals.rows[0].residual.source for scale in (1.0, 1.0, 2.0)]
     assert known[0] == known[1] != known[2]
-    path = lambda scale: executable_cache.ExecutableCache(folder).path_for(
-        try_step, {}, (registered(scale).residuals,)
-    )
+
+    def path(scale):
+        return executable_cache.ExecutableCache(folder).path_for(
+            try_step, {}, (registered(scale).residuals,)
+        )
+
     assert path(1.0) is not None
     assert path(1.0) == path(1.0) != path(2.0)
     unregistered = jaxba.residual(lambda point, *, at: point - at)(point=[0], at=0.0)
@@ -417,9 +431,10 @@ def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
     use_cache_of_jax(str(tmp_path / "of-jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     hits = []
-    listen = lambda event, **_: (
-        hits.append(event) if event == "/jax/compilation_cache/cache_hits" else None
-    )
+
+    def listen(event, **_):
+        return hits.append(event) if event == "/jax/compilation_cache/cache_hits" else None
+
     monitoring.register_event_listener(listen)
     try:
         call(jnp.arange(3.0))
@@ -440,7 +455,10 @@ def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
 
 def test_programs_of_both_levels_are_stored(folder, monkeypatch):
     monkeypatch.setattr("jaxba.solver.stepwise.quick_iterations", lambda kind, _: 1)
-    once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
+
+    def once():
+        return solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
+
     first = once()
     assert first.quick_iterations == 1
     assert sum(file.name.startswith(("propose", "try_step")) for file in kept(folder)) == 4
@@ -482,7 +500,8 @@ def test_a_static_argument_may_stand_anywhere(folder):
     def third(x, power, y):
         return x**power + y
 
-    third.__qualname__, third.__module__ = "third", "jaxba.somewhere"
+    third.__qualname__ = "third"
+    third.__module__ = "jaxba.somewhere"
     function = program(third, "power")
     for _ in range(2):
         with ParallelCompilation() as compile_programs:

@@ -46,7 +46,8 @@ class JittedAndNot(chex.TestCase):
 
     @chex.variants(with_jit=True, without_jit=True)
     def test_unfused_computation_changes_no_bit(self):
-        x, y = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4))), jnp.asarray(0.5)
+        x = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4)))
+        y = jnp.asarray(0.5)
         found = self.variant(lambda x, y, index: compute_unfused(squares, x, y, index=index))(
             x, y, INDEX
         )
@@ -90,7 +91,8 @@ def squares(x, y):
 
 
 def test_unfused_computation_maps_over_a_batch():
-    x, y = np.random.default_rng(0).normal(size=(3, 5, 4)), np.ones(3)
+    x = np.random.default_rng(0).normal(size=(3, 5, 4))
+    y = np.ones(3)
     found = jax.jit(jax.vmap(lambda x, y, index: compute_unfused(squares, x, y, index=index)))(
         x, y, np.stack([INDEX] * 3)
     )
@@ -98,7 +100,8 @@ def test_unfused_computation_maps_over_a_batch():
 
 
 def test_derivatives_pass_unfused_computation():
-    x, y = np.random.default_rng(0).normal(size=(5, 4)), jnp.asarray(0.5)
+    x = np.random.default_rng(0).normal(size=(5, 4))
+    y = jnp.asarray(0.5)
     there = jax.jit(
         jax.grad(lambda x, index: jnp.sum(compute_unfused(squares, x, y, index=index) ** 2))
     )(x, INDEX)
@@ -107,7 +110,8 @@ def test_derivatives_pass_unfused_computation():
 
 
 def test_a_dependency_leaves_the_value_as_it_is():
-    first, value = jnp.asarray([2.0, jnp.inf]), jnp.asarray([[1.0, -3.0], [0.0, 5.0]])
+    first = jnp.asarray([2.0, jnp.inf])
+    value = jnp.asarray([[1.0, -3.0], [0.0, 5.0]])
     assert np.array_equal(jax.jit(computed_after)(first, value), value)
     assert np.isnan(computed_after(first[1:], value)).all()
 
@@ -116,7 +120,8 @@ def test_a_dependency_leaves_the_value_as_it_is():
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_unfused_computation_is_a_branch_of_its_own():
     """XLA fuses nothing into a branch: one kernel becomes two and a conditional."""
-    x, y = jnp.ones((5, 4)), jnp.asarray(0.5)
+    x = jnp.ones((5, 4))
+    y = jnp.asarray(0.5)
     fused = jax.jit(lambda x, index: squares(x, y) + index[0]).lower(x, INDEX).compile().as_text()
     unfused = (
         jax.jit(lambda x, index: compute_unfused(squares, x, y, index=index) + index[0])
@@ -176,10 +181,12 @@ def test_one_loop_maps_over_a_batch():
 
 def test_derivatives_pass_through_one_loop():
     pair, scale, mask = given()
-    both = lambda make: (
-        lambda pair: sum(jnp.sum(row**2) for row in make(vectors, pair, scale, mask))
-    )
-    ours, truth = both(compute_in_one_loop), both(lambda function, *operands: function(*operands))
+
+    def both(make):
+        return lambda pair: sum(jnp.sum(row**2) for row in make(vectors, pair, scale, mask))
+
+    ours = both(compute_in_one_loop)
+    truth = both(lambda function, *operands: function(*operands))
     np.testing.assert_allclose(
         jax.jit(jax.grad(ours))(pair), jax.grad(truth)(pair), rtol=1e-12, atol=1e-12
     )

@@ -104,7 +104,8 @@ def test_an_option_that_a_jaxlib_does_not_know_is_left_out():
 def fused(monkeypatch):
     """Names of the programs with a fusion for YNNPACK that are compiled, or read from JAX's cache,
     meanwhile."""
-    found, compile_one = [], compiler.compile_or_get_cached
+    found = []
+    compile_one = compiler.compile_or_get_cached
 
     def watch(*arguments, **named):
         executable = compile_one(*arguments, **named)
@@ -124,9 +125,12 @@ def solved(**how):
 
 def gradient():
     problem = support.tiny()
-    loss = lambda inputs: jnp.sum(
-        differentiable_solve(problem, "ceres", SolveOptions(max_iterations=1))(inputs)[1] ** 2
-    )
+
+    def loss(inputs):
+        return jnp.sum(
+            differentiable_solve(problem, "ceres", SolveOptions(max_iterations=1))(inputs)[1] ** 2
+        )
+
     jax.grad(loss)(jax.tree.map(jnp.asarray, inputs_of(problem)))
 
 
@@ -137,10 +141,8 @@ def play():
 
 
 def learn():
-    sac, loop = (
-        SacConfig(width=16, batch=64),
-        LoopConfig(replay_capacity=300, updates_per_step=2, steps_per_chunk=2),
-    )
+    sac = SacConfig(width=16, batch=64)
+    loop = LoopConfig(replay_capacity=300, updates_per_step=2, steps_per_chunk=2)
     run_chunk(sac, loop, toys.ACTION, start(sac, loop, toys.ACTION, jax.random.key(0)))
 
 

@@ -16,12 +16,19 @@ from jaxba.runtime import loops
 
 def _collatz(loop, start):
     """Steps to one, and the largest number on the way."""
-    more = lambda state: state[0] > 1
-    step = lambda state: (
-        n := jnp.where(state[0] % 2 == 0, state[0] // 2, 3 * state[0] + 1),
-        jnp.maximum(state[1], n),
-    )
-    count = lambda state: (*step(state[:2]), state[2] + 1)
+
+    def more(state):
+        return state[0] > 1
+
+    def step(state):
+        return (
+            n := jnp.where(state[0] % 2 == 0, state[0] // 2, 3 * state[0] + 1),
+            jnp.maximum(state[1], n),
+        )
+
+    def count(state):
+        return (*step(state[:2]), state[2] + 1)
+
     _, largest, steps = loop(more, count, (start, start, jnp.zeros_like(start)))
     return largest, steps
 
@@ -42,14 +49,19 @@ def test_scenes_of_a_batch_end_on_their_own():
 
 @pytest.mark.parametrize(("first", "end"), [(0, 5), (3, 5), (2, 2), (4, 1)])
 def test_a_counted_loop_has_the_counts_of_lax(first, end):
-    body = lambda k, total: 10 * total + k
+    def body(k, total):
+        return 10 * total + k
+
     found = jax.jit(lambda end: loops.fori_loop(first, end, body, jnp.asarray(7)))(end)
     assert int(found) == int(lax.fori_loop(first, end, body, jnp.asarray(7)))
 
 
 def test_rows_are_mapped_in_order():
     rows = {"a": jnp.arange(12.0).reshape(4, 3), "b": jnp.arange(4)}
-    function = lambda row: (row["a"].sum() + row["b"], row["b"] > 1)
+
+    def function(row):
+        return (row["a"].sum() + row["b"], row["b"] > 1)
+
     chex.assert_trees_all_equal(
         jax.jit(lambda r: loops.map_rows(function, r))(rows), lax.map(function, rows)
     )
@@ -61,7 +73,9 @@ def test_xla_does_not_take_a_loop_over_long_vectors_for_a_small_one():
     """It compiles small loops to calls of one function, marked as such, which runs on one core."""
 
     def program(fori_loop):
-        body = lambda k, x: lax.cond(x[0] > k, lambda x: x[::-1] + 1, lambda x: 2 * x, x)
+        def body(k, x):
+            return lax.cond(x[0] > k, lambda x: x[::-1] + 1, lambda x: 2 * x, x)
+
         return (
             jax.jit(lambda x: fori_loop(0, 10, body, x)).lower(np.ones(100_000)).compile().as_text()
         )
@@ -80,7 +94,8 @@ def test_what_is_not_needed_is_the_other_value(needed):
 
 
 def test_members_of_a_batch_need_it_or_not():
-    needed, x = jnp.asarray([True, False]), jnp.arange(6.0).reshape(2, 3)
+    needed = jnp.asarray([True, False])
+    x = jnp.arange(6.0).reshape(2, 3)
     found = jax.vmap(lambda n, x: loops.run_if(n, lambda x: 2 * x, (x,), -x))(needed, x)
     np.testing.assert_array_equal(found, jnp.stack([2 * x[0], -x[1]]))
 
@@ -102,9 +117,10 @@ def _always(text: str, operation: str) -> bool:
 def test_what_is_not_needed_is_not_computed():
     """XLA takes what does not change in a loop out of it: so it does where the arguments pass no
     barrier."""
-    without = lambda needed, f, x, otherwise: loops.fori_loop(
-        0, needed.astype(int), lambda *_: f(*x), otherwise
-    )
+
+    def without(needed, f, x, otherwise):
+        return loops.fori_loop(0, needed.astype(int), lambda *_: f(*x), otherwise)
+
     text = {
         run: jax.jit(lambda n, x, run=run: run(n, jnp.sin, (x,), x))
         .lower(True, np.ones(1000))

@@ -67,9 +67,10 @@ def test_the_settings_of_the_program_around_change_no_result(name, expected):
 @pytest.mark.parametrize("name", ["strict promotion of types", "no promotion of ranks"])
 def test_a_step_can_be_traced_under_the_settings_of_the_program_around(name):
     prepared = jaxba.prepare(GAUGED, "ceres", OPTIONS)
-    cost = lambda damping: (
-        jaxba.lm_step(prepared.layout, prepared.state, damping, prepared.options)[0].cost
-    )
+
+    def cost(damping):
+        return jaxba.lm_step(prepared.layout, prepared.state, damping, prepared.options)[0].cost
+
     with SURROUNDINGS[name]():
         shape = jax.eval_shape(cost, DAMPINGS[0])
     assert shape.dtype == np.float64
@@ -109,8 +110,11 @@ def test_a_problem_of_numpy_inside_of_jit_is_refused_as_well():
 
 def test_float64_without_64_bits_is_refused_by_all_that_would_compute_in_float32():
     prepared = jaxba.prepare(GAUGED, "ceres", OPTIONS)
-    layout, state, options = prepared.layout, prepared.state, prepared.options
-    find, inputs = jaxba.differentiable_solve(GAUGED), jaxba.inputs_of(GAUGED)
+    layout = prepared.layout
+    state = prepared.state
+    options = prepared.options
+    find = jaxba.differentiable_solve(GAUGED)
+    inputs = jaxba.inputs_of(GAUGED)
     calls = [
         lambda: jaxba.solve_loop(layout, state, prepared.policy, jaxba.Tolerances(), options, 3),
         lambda: jaxba.lm_step(layout, state, jnp.asarray(1e-4), options),
@@ -176,7 +180,8 @@ def test_contexts_that_overlap_give_blas_its_threads_back():
 def check_overlap() -> None:
     before = blas_threads()
     assert set(before) == {2}
-    entered, leave = threading.Event(), threading.Event()
+    entered = threading.Event()
+    leave = threading.Event()
 
     def other() -> None:
         with process.single_blas_thread():

@@ -12,12 +12,16 @@ from jax import lax
 from jaxba.runtime import loops
 from jaxba.runtime.parts import in_turns, kept
 
-PARTS, SIZE = 4, 5
+PARTS = 4
+SIZE = 5
 
 
 def compare(function, divided, outputs, *arguments):
     """Both ways, on arguments of which the divided ones have a leading axis."""
-    axes = lambda flags: jax.tree.map(lambda one: 0 if one else None, flags)
+
+    def axes(flags):
+        return jax.tree.map(lambda one: 0 if one else None, flags)
+
     batched = jax.vmap(function, axes(divided), axes(outputs), axis_name="parts")
     in_parts = jax.jit(lambda *given: in_turns(function, "parts", given, divided, outputs))
     for found, wanted in zip(
@@ -34,7 +38,8 @@ def rows():
 def test_sums_of_sums_maxima_and_divided_results_are_those_of_a_batch(rows):
     def function(x, y):
         scaled = kept(jnp.sin(x) * y)
-        total, greatest = lax.psum((scaled.sum(), x), "parts"), lax.pmax(scaled.max(), "parts")
+        total = lax.psum((scaled.sum(), x), "parts")
+        greatest = lax.pmax(scaled.max(), "parts")
         return (
             total[0] * greatest,
             lax.psum(scaled * greatest, "parts"),
@@ -56,7 +61,10 @@ def test_loops_whose_state_is_divided_in_part_and_conditions_are_those_of_a_batc
         values, change, count = loops.while_loop(
             lambda now: (now[1] > tolerance) & (now[2] < 20), body, start
         )
-        squares = lambda: lax.psum(jnp.sum(values**2), "parts")
+
+        def squares():
+            return lax.psum(jnp.sum(values**2), "parts")
+
         inner = lax.cond(count > 3, squares, lambda: change)
         refined = loops.run_if(
             count > 2, lambda y: y + lax.psum(y.sum(), "parts"), (values,), values
@@ -83,11 +91,16 @@ def test_a_result_that_should_be_the_same_everywhere_is_refused_if_it_differs(ro
 
 
 def test_memory_is_that_of_one_part():
-    parts, size, width = 64, 1024, 32
+    parts = 64
+    size = 1024
+    width = 32
 
     def function(x):
         wide = jnp.sin(jnp.outer(jnp.arange(1.0, width), x))
-        product = lambda y: lax.psum(wide @ (wide.T @ y), "parts")
+
+        def product(y):
+            return lax.psum(wide @ (wide.T @ y), "parts")
+
         return loops.fori_loop(
             0, 3, lambda _, y: product(y) / jnp.linalg.norm(y), jnp.ones(width - 1)
         )

@@ -158,7 +158,8 @@ def test_circles_and_bases_that_cannot_be_read_are_one_line(files, message, tmp_
 
 @pytest.mark.slow
 def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distribution(tmp_path):
-    backend, clone = tmp_path / "backend", tmp_path / "clone"
+    backend = tmp_path / "backend"
+    clone = tmp_path / "clone"
     requires = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["build-system"][
         "requires"
     ]

@@ -40,7 +40,8 @@ def killed_after(count: int):
 def test_a_solve_that_was_killed_continues_to_the_same_end(
     policy, in_parts, tmp_path, monkeypatch, capsys
 ):
-    problem, file = support.tiny(), tmp_path / "solve.npz"
+    problem = support.tiny()
+    file = tmp_path / "solve.npz"
     monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
     if in_parts:
         monkeypatch.setattr(sharded, "LARGE", 1)
@@ -73,7 +74,8 @@ def test_a_solve_that_was_killed_continues_to_the_same_end(
 
 
 def test_numbers_of_residuals_are_in_it_and_more_iterations_may_follow(tmp_path):
-    problem, file = support.tiny(), tmp_path / "solve.npz"
+    problem = support.tiny()
+    file = tmp_path / "solve.npz"
     problem = jaxba.with_residual(
         problem, scaled(size=0, pose=[0, 1], measured=0.5), unknowns={"size": [[1.0]]}
     )
@@ -84,7 +86,8 @@ def test_numbers_of_residuals_are_in_it_and_more_iterations_may_follow(tmp_path)
     more = SolveOptions(
         linear_solver="implicit", max_iterations=12, tolerances=jaxba.Tolerances(ftol=0.0)
     )
-    found, whole = solve(problem, "ceres", more, checkpoint=file), solve(problem, "ceres", more)
+    found = solve(problem, "ceres", more, checkpoint=file)
+    whole = solve(problem, "ceres", more)
     assert found.iterations == whole.iterations
     np.testing.assert_allclose(
         found.problem.residuals.blocks[0], whole.problem.residuals.blocks[0], rtol=1e-6
@@ -97,7 +100,8 @@ def scaled(size, pose, *, measured):
 
 
 def test_a_reached_limit_is_not_solved_again_and_networks_differ_by_their_weights(tmp_path):
-    problem, file = support.tiny(), tmp_path / "solve.npz"
+    problem = support.tiny()
+    file = tmp_path / "solve.npz"
     five = replace(OPTIONS, max_iterations=5)
     done, again = (solve(problem, "ceres", five, checkpoint=file) for _ in range(2))
     assert again.iterations == done.iterations == 5
@@ -117,7 +121,8 @@ def test_a_reached_limit_is_not_solved_again_and_networks_differ_by_their_weight
 
 
 def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):
-    problem, file = support.tiny(), tmp_path / "solve.npz"
+    problem = support.tiny()
+    file = tmp_path / "solve.npz"
     options = SolveOptions(max_iterations=1)
     solve(problem, "ceres", options, checkpoint=file)
     for other, policy in (
@@ -128,10 +133,12 @@ def test_a_checkpoint_of_something_else_is_refused_in_one_line(tmp_path):
             ProblemError, match=r"solve.npz is the checkpoint of another problem, policy or options"
         ):
             solve(other, policy, options, checkpoint=file)
-    whole, array = file.read_bytes(), tmp_path / "array.npy"
+    whole = file.read_bytes()
+    array = tmp_path / "array.npy"
     np.save(array, np.zeros(3))
     # of the last member
-    compression, flags = whole.rindex(b"PK\x01\x02") + 10, whole.rindex(b"PK\x01\x02") + 8
+    compression = whole.rindex(b"PK\x01\x02") + 10
+    flags = whole.rindex(b"PK\x01\x02") + 8
     flipped = [whole[:at] + b"\x01" + whole[at + 1 :] for at in (compression, flags)]
     for damaged in (whole[:100], array.read_bytes(), *flipped):
         file.write_bytes(damaged)
@@ -166,7 +173,8 @@ def another_loss():
 
 
 def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance(tmp_path):
-    problem, file = support.tiny(), tmp_path / "solve.npz"
+    problem = support.tiny()
+    file = tmp_path / "solve.npz"
     options = SolveOptions(max_iterations=2, loss=jaxba.Loss(own_loss, 2.0))
     solve(problem, "ceres", options, checkpoint=file)
     # functions have other addresses in another process
@@ -188,15 +196,14 @@ def test_another_process_continues_with_a_loss_of_ones_own_and_another_tolerance
 
 @pytest.mark.slow
 def test_functions_and_losses_of_residuals_belong_to_a_checkpoint(tmp_path):
-    problem, file, rows = (
-        support.tiny(),
-        tmp_path / "solve.npz",
-        scaled(size=0, pose=[0, 1], measured=0.5),
-    )
+    problem = support.tiny()
+    file = tmp_path / "solve.npz"
+    rows = scaled(size=0, pose=[0, 1], measured=0.5)
     options = SolveOptions(max_iterations=1)
-    registered = lambda rows, loss: jaxba.with_residual(
-        problem, rows, unknowns={"size": [[1.0]]}, loss=loss
-    )
+
+    def registered(rows, loss):
+        return jaxba.with_residual(problem, rows, unknowns={"size": [[1.0]]}, loss=loss)
+
     solve(registered(rows, jaxba.Loss()), "ceres", options, checkpoint=file)
     for other in (
         registered(rows, jaxba.Loss("cauchy")),
@@ -215,7 +222,8 @@ def raised(size, pose, *, measured):
 
 def test_names_of_images_are_there_after_a_solve_continues(tmp_path):
     labels = Labels(tuple("abcdef"), np.arange(6), np.arange(6), np.arange(40))
-    problem, file = support.tiny().replace(labels=labels), tmp_path / "solve.npz"
+    problem = support.tiny().replace(labels=labels)
+    file = tmp_path / "solve.npz"
     for limit in (1, 2):
         found = solve(problem, "ceres", SolveOptions(max_iterations=limit), checkpoint=file)
         assert found.problem.labels == labels

@@ -50,7 +50,8 @@ def renumbered(problem: BundleProblem, seed: int) -> BundleProblem:
 @given(st.integers(1, 25), st.integers(1, 15), st.integers(0, 10**6), st.integers(0, 4))
 def test_pairs_blocks_and_reach_are_those_of_brute_force(cameras, points, seed, duplicates):
     problem = random_views(cameras, points, seed, duplicates)
-    pairs, shared = 0, np.zeros((cameras, cameras), bool)
+    pairs = 0
+    shared = np.zeros((cameras, cameras), bool)
     for point in range(points):
         track = problem.camera_index[problem.point_index == point]
         for i, a in enumerate(track):
@@ -144,7 +145,8 @@ def test_many_cameras_that_see_few_points_are_factored_by_way_of_the_points():
 
 
 def test_a_factorisation_beyond_the_machine_is_refused_where_there_is_no_choice(monkeypatch):
-    problem, options = random_scene(replace(SEQUENCE, cameras=50), 0), StepOptions()
+    problem = random_scene(replace(SEQUENCE, cameras=50), 0)
+    options = StepOptions()
     assert choose_linear_solver(problem, options, "explicit").linear_solver == "explicit"
     monkeypatch.setattr("jaxba.runtime.process.memory", lambda: 1e6)
     with pytest.raises(

@@ -48,7 +48,9 @@ def test_a_solve_in_which_no_observation_has_a_weight_is_no_success(method):
 
 @pytest.mark.slow
 def test_nor_in_the_compiled_loop_or_with_a_loss_of_ones_own():
-    flat = lambda s: jnp.minimum(s, 1.0)
+    def flat(s):
+        return jnp.minimum(s, 1.0)
+
     for loss in (Loss("tukey", 2.0), Loss(flat, 2.0)):
         found = solve(beyond(), "ceres", loss=loss)
         assert found.termination == Termination.NO_WEIGHT
@@ -156,7 +158,8 @@ def behind_glass() -> BundleProblem:
     problem = support.tiny()
     number = int(np.flatnonzero((problem.camera_index == 2) & (problem.point_index == 3))[0])
     assert number == 20
-    cameras, points = np.array(problem.cameras), np.array(problem.points)
+    cameras = np.array(problem.cameras)
+    points = np.array(problem.points)
     cameras[2, :6], points[3, 2] = 0, 0
     return problem.replace(cameras=cameras, points=points)
 
@@ -219,8 +222,10 @@ def test_the_explanation_is_that_of_the_loss():
 
 def test_messages_call_images_and_points_what_the_model_calls_them():
     problem = huge(1e200)
-    camera, point = problem.camera_index[17], problem.point_index[17]
-    names, count = tuple(f"{k}.jpg" for k in range(problem.num_cameras)), problem.num_cameras
+    camera = problem.camera_index[17]
+    point = problem.point_index[17]
+    names = tuple(f"{k}.jpg" for k in range(problem.num_cameras))
+    count = problem.num_cameras
     labels = Labels(
         names, 70 + np.arange(count), np.arange(count), 7000 + np.arange(problem.num_points)
     )

@@ -43,7 +43,8 @@ def test_observations_that_a_device_cannot_hold_are_refused_with_the_arithmetic(
 
 
 def test_parts_take_less_and_larger_problems_take_longer(monkeypatch):
-    in_parts, whole = estimate(1000, in_parts=True), estimate(1000)
+    in_parts = estimate(1000, in_parts=True)
+    whole = estimate(1000)
     assert in_parts.memory == {name: 1000 * size for name, size in BYTES_IN_PARTS.items()}
     assert all(in_parts.memory[name] < whole.memory[name] for name in whole.memory)
     orders = [

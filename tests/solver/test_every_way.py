@@ -58,7 +58,8 @@ def assert_alike(found: Solution, alone: Solution) -> None:
     assert found.termination == alone.termination
     np.testing.assert_allclose(found.initial_cost, alone.initial_cost, rtol=ALIKE)
     np.testing.assert_allclose(found.history.cost, alone.history.cost, rtol=ALIKE)
-    ours, theirs = found.problem, alone.problem
+    ours = found.problem
+    theirs = alone.problem
     np.testing.assert_allclose(ours.cameras, theirs.cameras, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(ours.points, theirs.points, rtol=1e-6, atol=1e-7)
     for block, other in zip(ours.residuals.blocks, theirs.residuals.blocks, strict=True):
@@ -107,7 +108,10 @@ def test_rows_are_solved_among_many_as_alone_by_any_policy(policy, small):
 def test_rows_of_any_residual_end_the_same_on_several_lanes(name):
     """As on a GPU, where lanes are batched."""
     problems = problems_of([name], 9)
-    function = lambda problem: problem.residuals.rows[0].residual
+
+    def function(problem):
+        return problem.residuals.rows[0].residual
+
     kept = [problem for problem in problems if function(problem) == function(problems[0])]
     sizes = [Sizes.of(set_up(problem, "ceres", OPTIONS).placed.here) for problem in kept]
     cell = Sizes(*np.max([one[:4] for one in sizes], axis=0).tolist(), 0)

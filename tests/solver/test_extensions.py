@@ -39,7 +39,8 @@ def with_loss(loss: Loss, **asked) -> jaxba.Solution:
     ids=["refined", "plain"],
 )
 def test_a_loss_written_by_hand_is_the_named_one(name, rho, asked):
-    named, own = with_loss(Loss(name, 1.7), **asked), with_loss(Loss(rho, 1.7), **asked)
+    named = with_loss(Loss(name, 1.7), **asked)
+    own = with_loss(Loss(rho, 1.7), **asked)
     assert (own.iterations, own.termination) == (named.iterations, named.termination)
     np.testing.assert_allclose(own.history.cost, named.history.cost, rtol=1e-9)
     np.testing.assert_allclose(own.problem.points, named.problem.points, rtol=1e-6, atol=1e-7)
@@ -117,7 +118,8 @@ def test_policies_that_jax_cannot_tell_apart_are_refused():
 
         return Twin()
 
-    first, second = make(2.0), make(3.0)
+    first = make(2.0)
+    second = make(3.0)
     jaxba.prepare(support.tiny(), first)
     with pytest.raises(
         ValueError,

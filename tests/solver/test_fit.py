@@ -8,7 +8,9 @@ import pytest
 
 from jaxba.solver.fit import Left, explained, fits, instead, is_scale
 
-ROWS, SIZE, UNKNOWNS = 20, 3, 12
+ROWS = 20
+SIZE = 3
+UNKNOWNS = 12
 
 
 def design(seed: int = 0) -> np.ndarray:
@@ -26,7 +28,8 @@ def left_of(jacobian: np.ndarray, values: np.ndarray, size: int = SIZE) -> Left:
 def test_right_deviations_fail_as_often_as_the_level_says():
     """Both tests of two kinds: 2,000 draws at a level of 5%; a rate below 2% would be a test
     without power."""
-    left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(1)
+    left = left_of(design(), np.zeros(ROWS * SIZE))
+    rng = np.random.default_rng(1)
     failed = 0
     for _ in range(2000):
         drawn = left.cofactor @ rng.normal(size=ROWS * SIZE)
@@ -35,7 +38,8 @@ def test_right_deviations_fail_as_often_as_the_level_says():
 
 
 def test_residuals_without_their_covariance_fail_less_often():
-    left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(2)
+    left = left_of(design(), np.zeros(ROWS * SIZE))
+    rng = np.random.default_rng(2)
     drawn = [
         (left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(1000)
     ]
@@ -45,7 +49,8 @@ def test_residuals_without_their_covariance_fail_less_often():
 def test_unknowns_of_rows_alone_make_the_test_of_all_rows_sharper_at_the_same_level():
     """12 unknowns of 60 numbers: half of the level is that of the sum of squares, which rows with
     standard deviations too small by 1.3 exceed more often than without the number of unknowns."""
-    left, rng = left_of(design(), np.zeros(ROWS * SIZE)), np.random.default_rng(9)
+    left = left_of(design(), np.zeros(ROWS * SIZE))
+    rng = np.random.default_rng(9)
     drawn = [
         (left.cofactor @ rng.normal(size=ROWS * SIZE)).reshape(ROWS, SIZE) for _ in range(2000)
     ]
@@ -56,7 +61,8 @@ def test_unknowns_of_rows_alone_make_the_test_of_all_rows_sharper_at_the_same_le
 
 
 def test_what_is_left_without_rows_is_what_a_solve_without_them_leaves():
-    jacobian, values = design(3), np.random.default_rng(4).normal(size=ROWS * SIZE)
+    jacobian = design(3)
+    values = np.random.default_rng(4).normal(size=ROWS * SIZE)
     left = left_of(jacobian, values)
     out = ((0, 2), (1, 5))
     gone = np.concatenate([left.kinds[kind][row] for kind, row in out])
@@ -75,7 +81,8 @@ def test_what_is_left_without_rows_is_what_a_solve_without_them_leaves():
 
 
 def test_every_deletion_lowers_the_squares_by_its_statistic():
-    jacobian, values = design(5), np.random.default_rng(6).normal(size=ROWS * SIZE)
+    jacobian = design(5)
+    values = np.random.default_rng(6).normal(size=ROWS * SIZE)
     left = left_of(jacobian, values)
     squares, rank = left.deletions(0)
     assert (rank == SIZE).all()

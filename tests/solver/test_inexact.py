@@ -15,9 +15,10 @@ TIGHT = {"tolerances": Tolerances(ftol=1e-13, xtol=1e-12), "max_iterations": 300
 def check(kind: int, seed: int, inexact: tuple[str, ...]) -> None:
     problem, loss = draw(kind, seed)
     for options in (TIGHT, {}):
-        end = lambda solver, options=options: solve(
-            problem, linear_solver=solver, loss=loss, compilation="quick", **options
-        )
+
+        def end(solver, options=options):
+            return solve(problem, linear_solver=solver, loss=loss, compilation="quick", **options)
+
         exact = end("explicit")
         if exact.termination == Termination.MAX_ITERATIONS:  # its steps are damped to the end
             continue

@@ -91,20 +91,25 @@ def test_one_that_cannot_be_solved_says_why_and_touches_no_other(small):
 def general() -> dict:
     """Problems with what cannot be padded, or with other residuals, four of each kind."""
     scenes = [scene(5, 30 + 3 * k, k) for k in range(4)]
-    shared = lambda p: p.replace(
-        lenses=Lenses(np.zeros(p.num_cameras, np.int32), np.ones((1, 3), bool))
-    )
-    held = lambda p: jaxba.hold(p, poses=[0], points=[1, 2])
-    placed = lambda p: jaxba.with_position_priors(
-        p,
-        -np.einsum(
-            "cji,cj->ci",
-            support.Rotation.from_rotvec(p.cameras[:, :3]).as_matrix(),
-            p.cameras[:, 3:6],
-        ),
-        stddev=0.1,
-        align=False,
-    )
+
+    def shared(p):
+        return p.replace(lenses=Lenses(np.zeros(p.num_cameras, np.int32), np.ones((1, 3), bool)))
+
+    def held(p):
+        return jaxba.hold(p, poses=[0], points=[1, 2])
+
+    def placed(p):
+        return jaxba.with_position_priors(
+            p,
+            -np.einsum(
+                "cji,cj->ci",
+                support.Rotation.from_rotvec(p.cameras[:, :3]).as_matrix(),
+                p.cameras[:, 3:6],
+            ),
+            stddev=0.1,
+            align=False,
+        )
+
     return {
         "shared lens": list(map(shared, scenes)),
         "constants": list(map(held, scenes)),
@@ -115,14 +120,10 @@ def general() -> dict:
 
 def in_pairs(problem):
     """The problem with its first two cameras in one frame, where they are."""
-    matrices, shifts = (
-        geometry.rotation_matrices(problem.cameras[:, :3]),
-        np.array(problem.cameras[:, 3:6]),
-    )
-    rotation, translation = (
-        np.tile(np.eye(3), (problem.num_cameras, 1, 1)),
-        np.zeros((problem.num_cameras, 3)),
-    )
+    matrices = geometry.rotation_matrices(problem.cameras[:, :3])
+    shifts = np.array(problem.cameras[:, 3:6])
+    rotation = np.tile(np.eye(3), (problem.num_cameras, 1, 1))
+    translation = np.zeros((problem.num_cameras, 3))
     rotation[1] = matrices[1] @ matrices[0].T
     translation[1] = shifts[1] - rotation[1] @ shifts[0]
     frame = np.maximum(np.arange(problem.num_cameras) - 1, 0).astype(np.int32)
@@ -132,7 +133,8 @@ def in_pairs(problem):
 @pytest.mark.slow  # a fast one, with constants: test_every_way.py
 @pytest.mark.parametrize("kind", ["shared lens", "constants", "priors", "rigs"])
 def test_what_a_problem_may_hold_it_may_hold_among_many(small, kind):
-    problems, options = general()[kind], replace(QUICK, loss=Loss("huber", 1.0))
+    problems = general()[kind]
+    options = replace(QUICK, loss=Loss("huber", 1.0))
     found = list(solve_many(problems, "ceres", options))
     assert_as_alone(found, problems, "ceres", options)
     assert all(one.capacity.fixed for one in found[1:])
@@ -140,7 +142,8 @@ def test_what_a_problem_may_hold_it_may_hold_among_many(small, kind):
 
 def test_an_endless_stream_is_read_no_further_than_it_must_be(small, monkeypatch):
     monkeypatch.setattr(many, "AHEAD", 10)
-    read, every = itertools.count(), mixed(5)
+    read = itertools.count()
+    every = mixed(5)
     stream = (every[next(read) % 5] for _ in itertools.count())
     results = solve_many(stream, "ceres", QUICK)
     assert isinstance(next(results), jaxba.Solution)
@@ -163,10 +166,8 @@ def test_a_program_that_fails_ends_nothing_but_its_problems(small, monkeypatch):
 
 @pytest.mark.slow
 def test_other_linear_solvers_solve_one_by_one(small):
-    problems, options = (
-        mixed(2),
-        SolveOptions(linear_solver="implicit", max_iterations=4, compilation="quick"),
-    )
+    problems = mixed(2)
+    options = SolveOptions(linear_solver="implicit", max_iterations=4, compilation="quick")
     found = list(solve_many(problems, "ceres", options))
     assert {one.linear_solver for one in found} == {"implicit"}
     assert_as_alone(found, problems, "ceres", options)
@@ -222,7 +223,10 @@ def test_every_problem_fits_its_cell_and_no_division_in_order_takes_less_time(se
     chosen = choose_cells(seen, times)
     placed = [cell_for(sizes, chosen) for sizes in seen]
     assert all(sizes.fits(cell) for sizes, cell in zip(seen, placed, strict=True))
-    time = lambda rows: work(np.array([cell[:4] for cell in rows])).sum() * times * cells.ITERATIONS
+
+    def time(rows):
+        return work(np.array([cell[:4] for cell in rows])).sum() * times * cells.ITERATIONS
+
     for kind in {sizes.exactly for sizes in seen}:
         own = [sizes for sizes in seen if sizes.exactly == kind]
         mine = [cell for cell in chosen if cell.exactly == kind]

@@ -46,7 +46,8 @@ def test_a_stream_that_fails_gives_the_results_of_what_was_read_first(solved):
         yield from itertools.repeat(scene, 20)
         raise KeyError("disk")
 
-    results, found = solve_many(stream()), []
+    results = solve_many(stream())
+    found = []
     with pytest.raises(KeyError, match="disk"):
         found.extend(results)
     assert [isinstance(result, Solution) for result in found] == [False, *[True] * 20]

@@ -79,7 +79,8 @@ def test_what_is_left_of_rows_is_what_solves_of_other_measurements_leave():
     centers = geometry.camera_centers(problem.cameras)
     problem = problem.replace(observations=geometry.project(problem))
     options = replace(QUICK, tolerances=jaxba.Tolerances(ftol=1e-15, xtol=1e-13, gtol=1e-12))
-    ends, step = [], 0.05
+    ends = []
+    step = 0.05
     for sign in (-1, 1):
         position = np.array(centers)
         position[3, 1] -= sign * step * SIGMA  # the residual before the solve grows by a step

@@ -17,7 +17,8 @@ import jaxba
 from jaxba import BundleProblem, residuals
 from jaxba.problem.residuals import Rows
 
-CAMERAS, POINTS = 8, 40
+CAMERAS = 8
+POINTS = 40
 FOCAL, PIXEL = 700.0, 0.5  # pixels
 GROSS = 20.0  # standard deviations
 SEEDS = 30
@@ -99,7 +100,8 @@ def depths(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     inside = np.einsum(
         "nij,nj->ni", scene.turns[camera], scene.points[point] - scene.centres[camera]
     )
-    row, sigma = 33, 0.05
+    row = 33
+    sigma = 0.05
     measured = 1.7 * inside[:, 2] + 0.3 + sigma * noise(rng, len(camera), row, gross)
     rows = residuals.depth(pose=camera, point=point, image=camera, measured=measured, sigma=sigma)
     return Measurement(
@@ -109,8 +111,10 @@ def depths(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
 
 def distances(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """Ten scale bars."""
-    first, second = np.arange(10), np.arange(10, 20)
-    row, sigma = 3, 0.02
+    first = np.arange(10)
+    second = np.arange(10, 20)
+    row = 3
+    sigma = 0.02
     length = np.linalg.norm(scene.points[second] - scene.points[first], axis=1)
     length = length + sigma * noise(rng, 10, row, gross)
     rows = residuals.distance(point=first, point_2=second, length=length, sigma=sigma)
@@ -119,7 +123,9 @@ def distances(scene: Scene, rng: np.random.Generator, gross: float) -> Measureme
 
 def baselines(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """Distances between successive cameras."""
-    first, row, sigma = np.arange(CAMERAS - 1), 2, 0.02
+    first = np.arange(CAMERAS - 1)
+    row = 2
+    sigma = 0.02
     length = np.linalg.norm(np.diff(scene.centres, axis=0), axis=1) + sigma * noise(
         rng, len(first), row, gross
     )
@@ -129,7 +135,8 @@ def baselines(scene: Scene, rng: np.random.Generator, gross: float) -> Measureme
 
 def plumb_lines(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """Up in the frame of each camera, which is across its first axis."""
-    row, sigma = 5, 0.01
+    row = 5
+    sigma = 0.01
     direction = scene.turns[:, :, 2] + sigma * rng.standard_normal((CAMERAS, 3))
     direction[row, 0] += sigma * gross
     up = np.array([[0.0, 0.0, 1.0]])
@@ -139,7 +146,8 @@ def plumb_lines(scene: Scene, rng: np.random.Generator, gross: float) -> Measure
 
 def odometry(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """Poses of each camera in the frame of the one before."""
-    first, row = np.arange(CAMERAS - 1), 4
+    first = np.arange(CAMERAS - 1)
+    row = 4
     sigma = np.repeat([0.01, 0.02], 3)  # radians and scene units
     error = sigma * rng.standard_normal((len(first), 6))
     error[row, 4] += sigma[4] * gross
@@ -173,7 +181,8 @@ def inertial(scene: Scene, rng: np.random.Generator, gross: float) -> Measuremen
         + white * np.sqrt(RATE) * rng.standard_normal((len(time), 6))
     )
     data = residuals.preintegrated(time, samples[:, :3], samples[:, 3:], MOMENTS, noise=IMU_NOISE)
-    first, row = np.arange(CAMERAS - 1), 3
+    first = np.arange(CAMERAS - 1)
+    row = 3
     covariance = np.linalg.inv(data["whitening"][row].T @ data["whitening"][row])
     turns = np.array(data["rotation"])
     error = Rotation.from_rotvec([0.0, gross * np.sqrt(covariance[1, 1]), 0.0])  # of the gyroscope
@@ -196,7 +205,9 @@ def range_finder(pose, point, offset, *, measured, sigma):
 def ranges(scene: Scene, rng: np.random.Generator, gross: float) -> Measurement:
     """A residual of a user's own, with a block of it: two ranges from each camera."""
     camera = np.repeat(np.arange(CAMERAS), 2)
-    point, row, sigma = np.arange(2 * CAMERAS), 7, 0.02
+    point = np.arange(2 * CAMERAS)
+    row = 7
+    sigma = 0.02
     measured = np.linalg.norm(scene.points[point] - scene.centres[camera], axis=1) + 0.1
     measured += sigma * noise(rng, len(point), row, gross)
     rows = range_finder(

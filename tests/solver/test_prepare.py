@@ -32,7 +32,9 @@ def test_a_loop_of_steps_written_by_hand_is_the_solve():
     solution = jaxba.solve(support.tiny(), rule, OPTIONS)
     prepared = prepare(support.tiny(), rule, OPTIONS)
     step = jax.jit(lm_step, static_argnames="options")
-    state, damping, costs = prepared.state, 0.01, []
+    state = prepared.state
+    damping = 0.01
+    costs = []
     for _ in range(solution.iterations):
         state, info = step(prepared.layout, state, jnp.asarray(damping), prepared.options)
         damping *= 0.5 if info.accepted and info.gain_ratio > rule.good_gain else 2.0
@@ -72,7 +74,8 @@ def test_two_problems_of_equal_shape_are_solved_at_once():
     )
 
     def run(layout, state):
-        policy, options = prepared[0].policy, prepared[0].options
+        policy = prepared[0].policy
+        options = prepared[0].options
         return solve_loop(
             layout, state, policy, OPTIONS.tolerances, options, OPTIONS.max_iterations
         )

@@ -45,7 +45,8 @@ def sequence() -> BundleProblem:
 def general() -> BundleProblem:
     """Shared and partly constant lenses, constant poses and points, priors, covariances."""
     problem = support.tiny()
-    cameras, lens = np.array(problem.cameras), np.array([0, 0, 1, 1, 2, 0], np.int32)
+    cameras = np.array(problem.cameras)
+    lens = np.array([0, 0, 1, 1, 2, 0], np.int32)
     cameras[:, 6:] = cameras[lens, 6:]
     free = np.array([[True, True, True], [True, False, True], [False, False, False]])
     spread = np.tile(np.diag([0.5, 2.0]), (problem.num_observations, 1, 1))
@@ -92,7 +93,8 @@ def bar(point, point_2, *, length):
 @pytest.mark.slow
 def test_residuals_of_points_and_of_two_cameras_are_those_of_one_device():
     problem = support.tiny()
-    camera, point = problem.camera_index[::5], problem.point_index[::5]
+    camera = problem.camera_index[::5]
+    point = problem.point_index[::5]
     rows = depth(
         pose=camera, point=point, image=camera, measured=-geometry.depths(problem)[::5] * 1.01
     )
@@ -197,7 +199,8 @@ def test_rows_of_two_points_may_be_in_one_part_alone(first, second, policy, monk
 
 
 def test_a_large_problem_of_many_cameras_has_a_part_at_least(monkeypatch):
-    problem, options = sequence(), StepOptions(linear_solver="implicit")
+    problem = sequence()
+    options = StepOptions(linear_solver="implicit")
     monkeypatch.setattr(sharded, "LARGE", 1)
     monkeypatch.setattr(sharded, "PART_OF_CAMERA", problem.num_observations)
     assert sharded.num_parts(problem, options, 1) == sharded.num_parts(problem, options, 2) == 1
@@ -209,7 +212,8 @@ def test_a_large_problem_of_many_cameras_has_a_part_at_least(monkeypatch):
 
 @pytest.mark.slow
 def test_a_callback_sees_the_same_iterations_and_stops():
-    problem, records = sequence(), []
+    problem = sequence()
+    records = []
     options = SolveOptions(linear_solver="implicit", devices=DEVICES, max_iterations=6)
     found = solve(
         problem,
@@ -241,7 +245,8 @@ def test_every_observation_is_on_one_device_and_each_has_its_share():
         order = np.asarray(layout.points)
         mask = np.asarray(layout.slot_mask)
         own = points[order[np.asarray(layout.slot_point)[mask]]]
-        camera, pixels = np.asarray(layout.slot_camera)[mask], np.asarray(layout.pixels)[:, mask]
+        camera = np.asarray(layout.slot_camera)[mask]
+        pixels = np.asarray(layout.pixels)[:, mask]
         found.update(zip(camera.tolist(), own.tolist(), *pixels.tolist(), strict=True))
     index = problem.camera_index.tolist(), problem.point_index.tolist()
     assert found == Counter(zip(*index, *problem.observations.T.tolist(), strict=True))
@@ -295,9 +300,12 @@ def start_two(file, *options: str, stderr: int = subprocess.STDOUT) -> list[subp
     command += ["--linear-solver", "implicit", "--compilation", "full"]
     ends = ["--coordinator", address, "--processes", "2", "--process"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    start = lambda k: subprocess.Popen(
-        [*command, *ends, str(k)], env=environment, stdout=subprocess.PIPE, stderr=stderr
-    )
+
+    def start(k):
+        return subprocess.Popen(
+            [*command, *ends, str(k)], env=environment, stdout=subprocess.PIPE, stderr=stderr
+        )
+
     return [start(k) for k in range(2)]
 
 

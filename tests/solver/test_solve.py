@@ -59,7 +59,8 @@ def test_the_compiled_loop_and_the_stepwise_one_are_the_same_solve(policy):
     # fewer that are right
     wanted = {"gradient_max": 1e-6, "gain_ratio": 1e-6 + 1e-13 * costs[1:] / -np.diff(costs)}
     for name in compiled.history._fields:
-        one, other = getattr(compiled.history, name), getattr(watched.history, name)
+        one = getattr(compiled.history, name)
+        other = getattr(watched.history, name)
         assert len(one) == len(other) == compiled.iterations
         bound = wanted.get(name, 1e-8) * np.abs(other)
         assert (np.abs(one.astype(float) - other) <= bound).all(), name
@@ -79,8 +80,12 @@ def test_the_compiled_loop_and_the_stepwise_one_are_the_same_solve(policy):
 def test_a_batch_of_solves_equals_a_loop_of_solves():
     """Scenes end after different numbers of iterations; those that are done must rest while the
     others go on."""
-    options, tolerances = StepOptions(), Tolerances()
-    run = lambda layout, state: solve_loop(layout, state, Ceres(), tolerances, options, 30)
+    options = StepOptions()
+    tolerances = Tolerances()
+
+    def run(layout, state):
+        return solve_loop(layout, state, Ceres(), tolerances, options, 30)
+
     pairs = [start(support.paper(seed)) for seed in range(8)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
     carries, histories = jax.jit(jax.vmap(run))(*stacked)
@@ -102,10 +107,8 @@ def test_a_batch_of_solves_equals_a_loop_of_solves():
 
 
 def test_a_policy_and_its_name_are_the_same():
-    by_name, by_object = (
-        stepwise(support.tiny(), "classic:0.03"),
-        stepwise(support.tiny(), Classic(initial=0.03)),
-    )
+    by_name = stepwise(support.tiny(), "classic:0.03")
+    by_object = stepwise(support.tiny(), Classic(initial=0.03))
     assert np.array_equal(by_name.history.cost, by_object.history.cost)
 
 
@@ -196,7 +199,8 @@ def test_cameras_that_nobody_looks_through_make_no_step_short():
     problem = support.tiny()
     idle = np.array([[0, 0, 0, 1e12, 0, 0, 500, 0, 0.0]])
     more = problem.replace(cameras=np.concatenate([problem.cameras, idle]))
-    plain, found = stepwise(problem), stepwise(more)
+    plain = stepwise(problem)
+    found = stepwise(more)
     np.testing.assert_allclose(found.history.cost, plain.history.cost, rtol=1e-9)
     assert found.termination == plain.termination
     np.testing.assert_array_equal(found.problem.cameras[-1], idle[0])

@@ -33,7 +33,8 @@ from jaxba.solver.prepare import DEFAULT_POLICY
 
 
 def test_every_default_of_the_command_is_that_of_the_options():
-    command, options = Arguments(), SolveOptions()
+    command = Arguments()
+    options = SolveOptions()
     plain = {field.name for field in fields(Arguments)} & {
         field.name for field in fields(SolveOptions)
     } - {"loss"}
@@ -85,7 +86,8 @@ def test_a_loss_leaves_the_step_that_the_policy_was_trained_with():
 
 
 def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
-    trained, loss = trained_step(make_policy("bold")), Loss("huber", 2.0)
+    trained = trained_step(make_policy("bold"))
+    loss = Loss("huber", 2.0)
     spelled_out = SolveOptions(
         loss=loss, refinement=trained.refinement, coordinates=trained.coordinates
     )
@@ -96,7 +98,8 @@ def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
 
 
 def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
-    refinement, coordinates = Refinement(points=1, trials=2), Coordinates(rotation="manifold")
+    refinement = Refinement(points=1, trials=2)
+    coordinates = Coordinates(rotation="manifold")
     trained = trained_step(make_policy(DEFAULT_POLICY))
     one = prepare(support.tiny(), options=SolveOptions(refinement=refinement)).options
     assert (one.refinement, one.coordinates) == (refinement, trained.coordinates)
@@ -116,7 +119,8 @@ def test_a_rule_brings_a_plain_step():
 def test_the_name_of_a_policy_brings_the_embedded_iterations_of_the_solver_of_that_name(
     name, tmp_path
 ):
-    path, log = tmp_path / "problem.txt", tmp_path / "log.json"
+    path = tmp_path / "problem.txt"
+    log = tmp_path / "log.json"
     write_problem(support.tiny(), path)
     problem = read_problem(path)
     expected = jaxba.solve(problem, *parse_solver(name).build()).history

@@ -111,7 +111,8 @@ def depth_in_metres(pose, point, *, measured):
 
 
 def measured(name: str, truth: jaxba.BundleProblem) -> list[jaxba.problem.residuals.Rows]:
-    camera, point = truth.camera_index[::7], truth.point_index[::7]
+    camera = truth.camera_index[::7]
+    point = truth.point_index[::7]
     centers = geometry.camera_centers(truth.cameras)
     rotation, translation = relative_poses(truth)
     index = {"pose": EACH, "pose_2": EACH + 1}
@@ -184,7 +185,8 @@ def test_one_scale_bar_costs_no_pixels(truth):
 def test_a_scale_that_is_one_of_the_unknowns_moves_no_scene(truth):
     """Depths with a scale of each image: the scale is found, and the size of the scene stays."""
     start = somewhere(truth, 50.0)
-    camera, point = start.camera_index[::7], start.point_index[::7]
+    camera = start.camera_index[::7]
+    point = start.point_index[::7]
     depths = geometry.depths(truth)[::7]
     rows = residuals.depth(pose=camera, point=point, image=camera, measured=depths, sigma=0.1)
     start = jaxba.with_residual(start, rows, unknowns={"image": np.tile([1.0, 0.0], (5, 1))})

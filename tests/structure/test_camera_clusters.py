@@ -45,7 +45,8 @@ def groups(label) -> set[frozenset[int]]:
 @given(sizes)
 def test_shared_points_are_those_that_two_cameras_both_see(size):
     problem = random_views(*size)
-    cameras, points = problem.num_cameras, problem.num_points
+    cameras = problem.num_cameras
+    points = problem.num_points
     found, seen = shared_points(
         np.asarray(problem.camera_index), np.asarray(problem.point_index), cameras, points
     )
@@ -61,7 +62,8 @@ def test_shared_points_are_those_that_two_cameras_both_see(size):
 def test_with_too_many_pairs_a_sample_of_the_points_is_counted(monkeypatch):
     """Every fourth point instead of all: a quarter of what each two share, since here all see
     all."""
-    camera, point = np.tile(np.arange(5), 400), np.repeat(np.arange(400), 5)
+    camera = np.tile(np.arange(5), 400)
+    point = np.repeat(np.arange(400), 5)
     monkeypatch.setattr(agglomeration, "MAX_PRODUCTS", 400 * 25 / 4)
     found, _ = shared_points(camera, point, 5, 400)
     assert np.array_equal(found.toarray(), 100 * (1 - np.eye(5)))
@@ -92,7 +94,8 @@ def test_two_far_groups_come_apart_however_the_cameras_are_numbered(seed):
     the other's."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(20)
-    one, other = order[:12], order[12:]
+    one = order[:12]
+    other = order[12:]
     edges = {(a, b): 10.0 for group in (one, other) for a in group for b in group if a < b}
     edges[one[0], other[0]] = 1.0
     assert groups(agglomerate(weights(20, edges), 20, 2)) == {
@@ -163,7 +166,8 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
         layout = build_layout(problem, StepOptions(linear_solver="sparse"))
-    found, cameras = clusters_of(layout), problem.num_cameras
+    found = clusters_of(layout)
+    cameras = problem.num_cameras
     count = len(found.members)
     assert count == max(1, cameras // cluster_cameras)
 
@@ -207,7 +211,10 @@ def test_there_are_never_more_clusters_than_the_limit(monkeypatch):
 
 def test_clusters_are_made_only_where_the_two_level_preconditioner_is_asked_for():
     problem = support.tiny()
-    made = lambda **changes: build_layout(problem, StepOptions(**changes)).clusters is not None
+
+    def made(**changes):
+        return build_layout(problem, StepOptions(**changes)).clusters is not None
+
     assert made(linear_solver="sparse")
     assert made(linear_solver="implicit")
     assert not made(

@@ -137,7 +137,8 @@ def test_every_block_has_exactly_its_place_and_every_camera_too(graph, tile):
     cameras = graph[0]
     rows, columns = random_graph(*graph)
     rank, reach = camera_order(rows, columns, cameras)
-    high, low = np.maximum(rank[rows], rank[columns]), np.minimum(rank[rows], rank[columns])
+    high = np.maximum(rank[rows], rank[columns])
+    low = np.minimum(rank[rows], rank[columns])
     names = np.sort(high * cameras + low)
     band = band_of(names, rank, reach, tile)
 

@@ -31,7 +31,8 @@ def problem_of(tracks: np.ndarray, cameras: int, seed: int, duplicates: int = 0)
         [rng.choice(cameras, t, replace=False) for t in tracks] or [np.zeros(0)]
     ).astype(int)
     again = rng.integers(len(point), size=duplicates)
-    point, camera = np.concatenate([point, point[again]]), np.concatenate([camera, camera[again]])
+    point = np.concatenate([point, point[again]])
+    camera = np.concatenate([camera, camera[again]])
     order = rng.permutation(len(point))
     return BundleProblem.create(
         rng.normal(size=(cameras, 9)),
@@ -149,7 +150,8 @@ def test_the_order_of_the_observations_does_not_matter():
         problem.camera_index[order],
         problem.point_index[order],
     )
-    one, other = build_layout(problem), build_layout(shuffled)
+    one = build_layout(problem)
+    other = build_layout(shuffled)
     assert one.buckets == other.buckets
     # slots name their observations by other numbers, of the same views
     np.testing.assert_array_equal(np.append(order, len(order))[other.observation], one.observation)
@@ -224,7 +226,8 @@ def test_the_first_level_is_as_wide_as_reads_least():
 
 
 def test_a_tree_of_one_level_gets_a_row_of_padding():
-    counts, rows = np.array([2, 0, 3]), np.append(np.arange(1, 6), 0)
+    counts = np.array([2, 0, 3])
+    rows = np.append(np.arange(1, 6), 0)
     levels = with_spare_row(sum_tree(np.arange(5), counts, 5, 3), 5)
     assert (levels[0] == 5).all(axis=1).sum() == 2  # the target without items, and the new one
     assert np.array_equal(sum_by_levels(rows, levels), [3, 0, 12])
@@ -275,7 +278,8 @@ def blocks_by_brute_force(
     camera."""
     found = np.zeros((problem.num_cameras, problem.num_cameras))
     slots = np.flatnonzero(layout.slot_mask)
-    camera, point = layout.slot_camera[slots], layout.slot_point[slots]
+    camera = layout.slot_camera[slots]
+    point = layout.slot_point[slots]
     for a in range(len(slots)):
         for b in np.flatnonzero(point == point[a]):
             if camera[a] >= camera[b]:
@@ -313,7 +317,8 @@ def test_pairs_of_constant_cameras_are_not_listed():
     held = hold(problem, poses=constant, lenses=constant)
     layout = build_layout(held, grid=False)
     slots = np.flatnonzero(layout.slot_mask)
-    camera, point = layout.slot_camera[slots], layout.slot_point[slots]
+    camera = layout.slot_camera[slots]
+    point = layout.slot_point[slots]
     moves = ~np.isin(camera, constant)
     tracks = np.bincount(point[moves])
     camera_of_sorted = support.by_camera(layout, np.asarray(layout.slot_camera))

@@ -73,7 +73,8 @@ def windows(count: int, cameras: int = 10) -> list:
 def mates(dense: bool) -> tuple:
     """Two problems of one cell that differ in every size."""
     if dense:
-        one, other = support.tiny(), sub_problem(support.tiny(), np.arange(5))
+        one = support.tiny()
+        other = sub_problem(support.tiny(), np.arange(5))
         extra = np.vstack([other.points, np.ones((3, 3))])  # nobody observes these
         other = other.replace(points=extra)
     else:
@@ -81,9 +82,10 @@ def mates(dense: bool) -> tuple:
         others = [
             other.replace(cameras=np.vstack([other.cameras, np.ones((2, 9))])) for other in fewer
         ]
-        differ = lambda a, b: (
-            a.num_points != b.num_points and a.num_observations != b.num_observations
-        )
+
+        def differ(a, b):
+            return a.num_points != b.num_points and a.num_observations != b.num_observations
+
         one, other = next(
             (a, b)
             for a in windows(31)
@@ -183,7 +185,8 @@ def test_a_capacity_holds_its_problem_and_no_more_than_the_next_size(
 def test_a_tree_with_room_sums_every_target_once_in_one_shape(counts, width, seed):
     counts = np.array(counts)
     rng = np.random.default_rng(seed)
-    items, empty = rng.permutation(counts.sum()), int(counts.sum())
+    items = rng.permutation(counts.sum())
+    empty = int(counts.sum())
     rows = np.append(rng.integers(-1000, 1000, counts.sum()), 0)
     expected = np.zeros(len(counts), int)
     np.add.at(expected, np.repeat(np.arange(len(counts)), counts), rows[items])
@@ -203,9 +206,11 @@ def test_a_tree_with_room_sums_every_target_once_in_one_shape(counts, width, see
 def test_ranks_sum_every_target_once(counts, first, seed):
     counts = np.sort(counts)[::-1]
     rng = np.random.default_rng(seed)
-    items, empty = rng.permutation(counts.sum()), int(counts.sum())
+    items = rng.permutation(counts.sum())
+    empty = int(counts.sum())
     rows = np.append(rng.integers(-1000, 1000, counts.sum()), 0)
-    expected, start = np.zeros(len(counts), int), np.cumsum(counts) - counts
+    expected = np.zeros(len(counts), int)
+    start = np.cumsum(counts) - counts
     rank = np.arange(len(items)) - np.repeat(start, counts)
     np.add.at(
         expected,
@@ -223,10 +228,13 @@ def test_ranks_of_usual_counts_have_one_shape(most):
     """Counts that fall with the square of the rank; and some that do not, which get longer
     prefixes."""
     usual = [np.sort(np.minimum(most, np.arange(200) // step))[::-1] for step in (40, 50)]
-    shapes_of = lambda counts: [
-        level.shape
-        for level in prefix_levels(np.arange(counts.sum()), counts, 2000, Room(2000, 33))
-    ]
+
+    def shapes_of(counts):
+        return [
+            level.shape
+            for level in prefix_levels(np.arange(counts.sum()), counts, 2000, Room(2000, 33))
+        ]
+
     few = np.zeros(200, int)
     assert shapes_of(usual[0]) == shapes_of(usual[1]) == shapes_of(few)
     few[:60] = 33
@@ -284,7 +292,8 @@ def test_shapes_follow_from_the_capacity_alone(one, other, grid, batch):
         cameras = rng.integers(1, 9)
         tracks = np.append(1, np.minimum(cameras, rng.geometric(0.4, rng.integers(1, 60)) - 1))
         if grid:  # every camera sees every point, and there are no cameras to pad
-            cameras, tracks = 8, np.full(rng.integers(1, 42), 8)
+            cameras = 8
+            tracks = np.full(rng.integers(1, 42), 8)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(covisibility, "PAIR_BATCH", batch)
             made.append(build_layout(problem_of(tracks, cameras, seed), grid=grid, capacity=SMALL))
@@ -434,7 +443,10 @@ def test_what_nobody_observes_comes_back_bit_by_bit_and_the_rest_moves():
 def compilations(run) -> int:
     """Programs that JAX traced or compiled meanwhile."""
     events = []
-    listen = lambda event, seconds, **_: events.append(event) if "compile" in event else None
+
+    def listen(event, seconds, **_):
+        return events.append(event) if "compile" in event else None
+
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         run()
@@ -454,9 +466,10 @@ def test_another_problem_of_the_same_cell_compiles_nothing(run, dense):
     unobserved."""
     one, other = mates(dense)
     run(one, "ceres", pad=True, max_iterations=3)
-    again = lambda **how: compilations(
-        lambda: run(other, Ceres(initial=0.7), max_iterations=3, **how)
-    )
+
+    def again(**how):
+        return compilations(lambda: run(other, Ceres(initial=0.7), max_iterations=3, **how))
+
     assert again(pad=True) == 0
     assert again(pad=False) > 0
 

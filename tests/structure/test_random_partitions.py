@@ -33,7 +33,8 @@ def observed(cameras: int, points: int, seed: int, share: float = 0.3) -> Bundle
 
 
 def graph_of(problem: BundleProblem) -> csr_matrix:
-    camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    camera = np.asarray(problem.camera_index)
+    point = np.asarray(problem.point_index)
     return camera_graph(camera, point, problem.num_cameras, problem.num_points)
 
 
@@ -75,10 +76,15 @@ def test_cameras_in_a_cluster_hang_together_by_shared_points(size, largest):
 
 def test_clusterings_differ_from_turn_to_turn_and_repeat_with_their_seed():
     graph = graph_of(observed(40, 200, 0))
-    draw = lambda seed: np.stack(
-        list(itertools.islice(clusterings(graph, 10, np.random.default_rng(seed)), 5))
-    )
-    same = lambda a, b: np.array_equal(a[:, None] == a, b[:, None] == b)
+
+    def draw(seed):
+        return np.stack(
+            list(itertools.islice(clusterings(graph, 10, np.random.default_rng(seed)), 5))
+        )
+
+    def same(a, b):
+        return np.array_equal(a[:, None] == a, b[:, None] == b)
+
     assert np.array_equal(draw(3), draw(3))
     assert not any(same(a, b) for a, b in itertools.combinations(draw(3), 2))
     assert not same(draw(3)[0], draw(4)[0])

@@ -44,7 +44,8 @@ def test_sums_over_points_and_cameras_have_the_observations_of_rows(kind):
         problem = placed(row_examples.with_rows_of(row_examples.scene(0), [name], 0)).here
         rng = np.random.default_rng(1)
         values = rng.integers(1, 1 << 20, problem.num_observations).astype(float)
-        by_point, by_camera = np.zeros(problem.num_points), np.zeros(problem.num_cameras)
+        by_point = np.zeros(problem.num_points)
+        by_camera = np.zeros(problem.num_cameras)
         for layout, observations, points in layouts(problem, kind):
             in_slots = jnp.asarray(np.append(values[observations], 0.0)[layout.observation])
             sums = np.append(point_sum(layout, in_slots[None])[0], 0.0)
@@ -64,11 +65,13 @@ def test_the_slots_of_a_row_hold_its_observations(kind):
     for name in (*READY_MADE, OWN):
         problem = placed(row_examples.with_rows_of(row_examples.scene(0), [name], 0)).here
         ((layout, *_),) = layouts(problem, kind)
-        (given,), (rows,) = problem.residuals.rows, layout.residuals
+        (given,) = problem.residuals.rows
+        (rows,) = layout.residuals
         np.testing.assert_array_equal(
             np.moveaxis(layout.observation[rows.slots], 2, 0), given.observation
         )
-        pixels, used = np.asarray(layout.slot_mask), np.asarray(layout.slot_used)
+        pixels = np.asarray(layout.slot_mask)
+        used = np.asarray(layout.slot_used)
         assert not pixels[rows.slots].any(), name
         assert used[rows.slots].all(), name
         assert used.sum() == problem.num_observations, name

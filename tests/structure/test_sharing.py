@@ -21,7 +21,8 @@ def copy_matrix(sharing: Sharing) -> np.ndarray:
 def flat() -> tuple[Sharing, np.ndarray]:
     """Two numbers of items that differ, then three of the items of `NAMES`, and names of all of
     them."""
-    apart, named = Sharing.of(np.arange(len(NAMES))), Sharing.of(NAMES)
+    apart = Sharing.of(np.arange(len(NAMES)))
+    named = Sharing.of(NAMES)
     rows = [
         [*(f"of item {item}: {k}" for k in range(2)), *(f"of name {name}: {k}" for k in range(3))]
         for item, name in enumerate(NAMES)
@@ -45,13 +46,14 @@ def test_items_of_equal_names_are_one_unknown():
 def test_products_are_those_of_the_matrix_of_copies(sharing):
     copies = copy_matrix(sharing)
     items, unknowns = copies.shape
-    rows, values = (
-        jnp.asarray(RNG.normal(size=(items, 3))),
-        jnp.asarray(RNG.normal(size=(unknowns, 3))),
-    )
+    rows = jnp.asarray(RNG.normal(size=(items, 3)))
+    values = jnp.asarray(RNG.normal(size=(unknowns, 3)))
     matrix = RNG.normal(size=(items, items))
     matrix = matrix + matrix.T
-    near = lambda found, wanted: np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
+
+    def near(found, wanted):
+        return np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
+
     near(sharing.total(rows), copies.T @ rows)
     near(sharing.copied(values), copies @ values)
     near(sharing.sums(rows), copies @ copies.T @ rows)
@@ -64,7 +66,8 @@ def test_products_are_those_of_the_matrix_of_copies(sharing):
 
 
 def test_what_differs_or_is_free_everywhere_is_left_alone():
-    apart, rows = Sharing.of(np.arange(7)), jnp.ones((7, 7))
+    apart = Sharing.of(np.arange(7))
+    rows = jnp.ones((7, 7))
     assert all(
         function(rows) is rows for function in (apart.sums, apart.mean, apart.shares, apart.merged)
     )

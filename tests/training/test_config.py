@@ -82,7 +82,8 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
 
 
 def test_the_tuned_preset_has_the_papers_game_state_and_networks():
-    paper, tuned = load("paper"), load("paper-tuned")
+    paper = load("paper")
+    tuned = load("paper-tuned")
     assert tuned.bank == paper.bank
     assert tuned.step_options == load("paper", ["linear_solver=explicit"]).step_options
     assert tuned.game == dataclasses.replace(paper.game, scale=tuned.game.scale)

@@ -77,7 +77,8 @@ def same(one: Outcome, other: Outcome) -> None:
         (one.state, other.state),
         ([x.actor for x in one.best], [x.actor for x in other.best]),
     ):
-        first, second = checkpoint.pack(a), checkpoint.pack(b)
+        first = checkpoint.pack(a)
+        second = checkpoint.pack(b)
         assert list(first) == list(second)
         for name in first:
             assert first[name].tobytes() == second[name].tobytes(), name
@@ -207,7 +208,8 @@ def test_several_agents_learn_side_by_side_what_each_learns_alone_also_after_a_k
     whole, tmp_path
 ):
     config = dataclasses.replace(CONFIG, seeds=2)
-    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    straight = tmp_path / "straight"
+    broken = tmp_path / "broken"
     outcome = run(straight, config)
     found = rows(straight)
     assert [(row["seed"], row["chunk"]) for row in found] == [

@@ -10,13 +10,17 @@ import pytest
 from jaxba.training import replay
 from jaxba.training.replay import Transition
 
-FEATURES, ACTIONS = 3, 2
+FEATURES = 3
+ACTIONS = 2
 
 
 def transitions(first: int, count: int) -> Transition:
     """Transitions that carry their number in every place, each place with another fraction."""
     number = np.arange(first, first + count, dtype=np.float64)
-    wide = lambda width, shift: number[:, None] + shift + np.arange(width) / 64
+
+    def wide(width, shift):
+        return number[:, None] + shift + np.arange(width) / 64
+
     columns = (
         wide(FEATURES, 0.0),
         wide(ACTIONS, 0.25),

@@ -18,7 +18,8 @@ from jaxba.training.config import load
 from jaxba.training.replay import Transition
 from jaxba.training.sac import Learner, SacConfig
 
-FEATURES, ACTIONS = 3, 2
+FEATURES = 3
+ACTIONS = 2
 SMALL = SacConfig(width=8, layers=1, batch=32, gamma=0.5, learning_rate=1e-5)
 """So small a rate that what is updated first does not disturb what is computed next."""
 
@@ -37,8 +38,13 @@ def fresh(config: SacConfig) -> Learner:
 
 def batch(count: int = 32, reward: float = 2.0, discount: float = 1.0) -> Transition:
     keys = jax.random.split(jax.random.key(2), 3)
-    wide = lambda key, size: jax.random.uniform(key, (count, size), jnp.float64, -1, 1)
-    full = lambda x: jnp.full(count, x, jnp.float64)
+
+    def wide(key, size):
+        return jax.random.uniform(key, (count, size), jnp.float64, -1, 1)
+
+    def full(x):
+        return jnp.full(count, x, jnp.float64)
+
     return Transition(
         wide(keys[0], FEATURES),
         wide(keys[1], ACTIONS),
@@ -89,13 +95,23 @@ def test_density_is_that_of_the_squashed_variable(mean: float, log_std: float) -
 
 
 def test_samples_follow_the_density() -> None:
-    mean, log_std = 0.4, -0.3
-    full = lambda value: jnp.full((20_000, 1), value, jnp.float32)
+    mean = 0.4
+    log_std = -0.3
+
+    def full(value):
+        return jnp.full((20_000, 1), value, jnp.float32)
+
     action, log_prob = networks.sample_action(full(mean), full(log_std), jax.random.key(0))
     assert action.dtype == log_prob.dtype == jnp.float32
-    cdf = lambda u: stats.norm.cdf(np.arctanh(u), mean, np.exp(log_std))
+
+    def cdf(u):
+        return stats.norm.cdf(np.arctanh(u), mean, np.exp(log_std))
+
     assert stats.kstest(np.asarray(action[:, 0], np.float64), cdf).pvalue > 1e-3
-    density = lambda u: np.exp(stats.norm.logpdf(np.arctanh(u), mean, np.exp(log_std))) / (1 - u**2)
+
+    def density(u):
+        return np.exp(stats.norm.logpdf(np.arctanh(u), mean, np.exp(log_std))) / (1 - u**2)
+
     entropy = integrate.quad(lambda u: -density(u) * np.log(density(u)), -1 + 1e-9, 1 - 1e-9)[0]
     np.testing.assert_allclose(-jnp.mean(log_prob), entropy, atol=0.02)
 
@@ -132,7 +148,8 @@ def test_everything_is_float32_and_the_members_differ() -> None:
 
 @pytest.mark.parametrize("config", [SMALL, VALUE], ids=["twin", "value"])
 def test_a_fresh_agent_knows_nothing(config: SacConfig) -> None:
-    learner, data = fresh(config), batch()
+    learner = fresh(config)
+    data = batch()
     opinions = sac._critic(config).apply(
         learner.critic, *(jnp.asarray(x, jnp.float32) for x in data[:2])
     )
@@ -156,7 +173,8 @@ def test_log_std_stays_within_its_bounds() -> None:
 
 
 def test_acting() -> None:
-    learner, observation = fresh(SMALL), batch().observation
+    learner = fresh(SMALL)
+    observation = batch().observation
     certain = sac.act(SMALL, learner.actor, observation, None)
     drawn = [sac.act(SMALL, learner.actor, observation, jax.random.key(i)) for i in (0, 0, 1)]
     assert certain.shape == (32, ACTIONS)
@@ -207,8 +225,11 @@ def test_the_entropy_bonus_has_the_temperature_as_its_weight() -> None:
     )
     _, metrics = _update(SMALL, learner, batch(reward=0.0))
     np.testing.assert_allclose(metrics["actor_loss"], -1 - 0.1 * metrics["entropy"], rtol=1e-4)
+
     # the fresh policy is the same everywhere: tanh of a standard normal number, twice
-    density = lambda x: stats.norm.pdf(x) * (2 * np.log(np.cosh(x)) + stats.norm.logpdf(x))
+    def density(x):
+        return stats.norm.pdf(x) * (2 * np.log(np.cosh(x)) + stats.norm.logpdf(x))
+
     entropy = -2 * integrate.quad(density, -8, 8)[0]
     np.testing.assert_allclose(metrics["entropy"], entropy, atol=0.3)
     np.testing.assert_allclose(
@@ -227,7 +248,8 @@ def test_the_target_follows_softly_or_now_and_then() -> None:
     learner = fresh(VALUE)
     start = learner.target
     for count in range(1, 7):
-        before, (learner, _) = learner, _update(VALUE, learner, batch())
+        before = learner
+        (learner, _) = _update(VALUE, learner, batch())
         assert int(learner.updates) == count
         chex.assert_trees_all_equal(
             learner.target, learner.value if count % 3 == 0 else before.target
@@ -241,7 +263,8 @@ def test_the_temperature_moves_towards_the_wanted_entropy(log_std: float, direct
     learner = fresh(SMALL)
     learner = learner._replace(actor=zeroed(learner.actor, [0.0, 0.0, log_std, log_std]))
     for _ in range(3):
-        before, (learner, metrics) = learner.log_temperature, _update(SMALL, learner, batch())
+        before = learner.log_temperature
+        (learner, metrics) = _update(SMALL, learner, batch())
         assert np.sign(metrics["entropy"] - -ACTIONS) == -direction
         assert np.sign(learner.log_temperature - before) == direction
 
@@ -255,8 +278,11 @@ def test_a_fixed_temperature_stays() -> None:
 def test_the_papers_networks_have_as_many_layers_as_it_says() -> None:
     paper = load("paper").sac
     layers = jax.eval_shape(lambda key: sac.init(paper, key, 5, 1), jax.random.key(0))
-    count = lambda params: sum(
-        "kernel" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(params)
-    )
+
+    def count(params):
+        return sum(
+            "kernel" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(params)
+        )
+
     # two critics, stacked
     assert (count(layers.actor), count(layers.critic), count(layers.value)) == (4, 3, 3)

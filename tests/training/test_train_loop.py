@@ -44,7 +44,8 @@ CHUNKS = 4
 @functools.cache
 def trained(agent: str, toy: toys.Toy) -> tuple[LoopState, dict[str, float]]:
     """State and last metrics after 1000 vector steps."""
-    state, metrics = start(AGENTS[agent], LONG, toy, jax.random.key(0)), {}
+    state = start(AGENTS[agent], LONG, toy, jax.random.key(0))
+    metrics = {}
     for _ in range(CHUNKS):
         state, metrics = run_chunk(AGENTS[agent], LONG, toy, state)
     return state, {name: float(value) for name, value in metrics.items()}
@@ -54,7 +55,8 @@ def opinions(
     agent: str, toy: toys.Toy, sign: float, clock: float = 0.0, action: float | None = None
 ) -> np.ndarray:
     """What both critics say, at the policy's own action when None."""
-    config, learner = AGENTS[agent], trained(agent, toy)[0].learner
+    config = AGENTS[agent]
+    learner = trained(agent, toy)[0].learner
     observation = jnp.asarray([[sign, clock]], jnp.float32)
     chosen = (
         sac.act(config, learner.actor, observation, None)
@@ -154,7 +156,8 @@ def _is_first(path) -> bool:
 def test_a_truncated_episode_has_the_value_of_its_true_last_observation(
     agent: str, sign: float
 ) -> None:
-    truth, mistaken = 1 / (1 - GAMMA), 1 / (1 - GAMMA / 2)
+    truth = 1 / (1 - GAMMA)
+    mistaken = 1 / (1 - GAMMA / 2)
     assert truth > 2 * mistaken
     np.testing.assert_allclose(opinions(agent, toys.ENDLESS, sign), sign * truth, atol=1)
 
@@ -168,7 +171,8 @@ def test_the_toy_tells_a_wrong_last_observation_and_a_wrong_terminal_apart(sign:
 
 @pytest.mark.slow
 def test_the_entropy_reaches_what_is_wanted() -> None:
-    state, entropy = start(LEARNS, SHORT, toys.ACTION, jax.random.key(0)), []
+    state = start(LEARNS, SHORT, toys.ACTION, jax.random.key(0))
+    entropy = []
     for _ in range(150):
         state, metrics = run_chunk(LEARNS, SHORT, toys.ACTION, state)
         entropy.append(metrics["entropy"])
@@ -249,7 +253,8 @@ def test_the_spread_of_actions_is_that_of_what_is_to_be_done() -> None:
 
 def test_the_warm_up_holds_the_demonstrations() -> None:
     state = start(TWIN, LONG, toys.ACTION, jax.random.key(3))
-    actions, rewards = state.replay.rows[:208, 2], state.replay.rows[:208, 5]
+    actions = state.replay.rows[:208, 2]
+    rewards = state.replay.rows[:208, 5]
     assert np.ptp(actions) > 1.8
     np.testing.assert_allclose(rewards, -((actions - 0.3) ** 2), atol=1e-6)
     assert int(state.updates) == 0

@@ -73,7 +73,10 @@ def test_a_chunk_has_a_line_and_its_held_out_scores_another():
 
 def test_a_policy_that_learned_nothing_is_called_that_once_in_plain_words():
     row = rows(1, (5.0, 6.0, 7.0))[1]
-    said = lambda **changed: view.lines([row | changed], 4, RULES, decades=6.0)[3:]
+
+    def said(**changed):
+        return view.lines([row | changed], 4, RULES, decades=6.0)[3:]
+
     assert said() == []
     assert said(q_bias=None) == []
     (same,) = said(action_spread=0.003)

@@ -21,7 +21,8 @@ import jaxba
 pytest.importorskip("viser", reason="needs the extra: pip install jaxba[view]")
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+CHROMIUM = shutil.which("chromium")
+DRIVER = shutil.which("chromedriver")
 
 pytestmark = [
     pytest.mark.extra,
@@ -218,7 +219,10 @@ def click(browser, at: tuple[int, int]) -> None:
 def test_clicks_move_into_a_camera_and_show_the_track_of_a_point(browser, viewer):
     browser.get(viewer.url)
     before = like(settled(browser), ORANGE)
-    text = lambda: browser.find_element("tag name", "body").text
+
+    def text():
+        return browser.find_element("tag name", "body").text
+
     (stage,) = viewer.stages
     (client,) = viewer.server.get_clients().values()
     start = client.camera.position
@@ -254,7 +258,8 @@ def test_clicks_move_into_a_camera_and_show_the_track_of_a_point(browser, viewer
 
 def test_points_are_left_out_by_error_and_track_length(viewer):
     (stage,) = viewer.stages
-    measures, limit = stage.measures, float(np.median(stage.measures.of_point))
+    measures = stage.measures
+    limit = float(np.median(stage.measures.of_point))
     stage.change(errors=(limit, np.inf), lengths=(3, 5))
     expected = np.flatnonzero(
         (measures.of_point >= limit) & (measures.tracks >= 3) & (measures.tracks <= 5)
@@ -311,7 +316,10 @@ def test_a_page_in_a_file_plays_without_a_server(browser, recording, tmp_path):
     wait_for(lambda: coloured(scene(browser)) > 500, browser)
     first = scene(browser)
     wait_for(lambda: (np.abs(scene(browser) - first).max(axis=2) > 60).sum() > 200, browser)
-    text = lambda: browser.find_element("tag name", "body").text
+
+    def text():
+        return browser.find_element("tag name", "body").text
+
     assert "worst images" in text()
     wait_for(lambda: f"iteration {recording.last} of {recording.last}, cost" in text(), browser)
     wait_for(lambda: "start, cost" in text(), browser)

@@ -36,7 +36,8 @@ def pinhole_problem(model: str) -> BundleProblem:
 @pytest.mark.parametrize("model", ["BAL", "PINHOLE"])
 def test_corners_of_a_frustum_project_to_the_corners_of_the_image(model):
     problem = pinhole_problem(model)
-    frusta, poses = frusta_of(problem), geometry.camera_poses(np.asarray(problem.cameras))
+    frusta = frusta_of(problem)
+    poses = geometry.camera_poses(np.asarray(problem.cameras))
     depth = np.array([depth_of_image(half, 0.2) for half in frusta.half])
     plane = (
         np.concatenate([CORNERS * frusta.half[:, None], np.ones((2, 4, 1))], axis=2)
@@ -66,7 +67,8 @@ def test_a_segment_runs_from_the_measured_towards_the_predicted_pixel(model):
 
 def test_a_large_residual_ends_outside_of_the_image_but_not_far():
     problem = pinhole_problem("PINHOLE")
-    frusta, residuals = frusta_of(problem), np.full((8, 2), 1e9)
+    frusta = frusta_of(problem)
+    residuals = np.full((8, 2), 1e9)
     start, end = residual_segments(problem, frusta, residuals, 0, 1.0).transpose(1, 0, 2)
     assert (np.abs(end) > frusta.half[0]).any(axis=1).all()
     np.testing.assert_allclose(
@@ -88,7 +90,8 @@ def test_on_the_page_cameras_stand_upright_around_the_origin():
 
 def test_measures_are_those_of_each_image_and_point():
     problem = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=60), 0)
-    found, length = measure(problem), np.linalg.norm(geometry.residuals(problem), axis=1)
+    found = measure(problem)
+    length = np.linalg.norm(geometry.residuals(problem), axis=1)
     for values, index in (
         (found.of_image, problem.camera_index),
         (found.of_point, problem.point_index),

@@ -23,12 +23,16 @@ def problem():
 
 @pytest.fixture(scope="module")
 def recorded(problem):
-    recorder, seen = Recorder(problem, "here"), []
-    watch = lambda record, now: (
-        recorder(record, now),
-        seen.append(record.time_s),
-        time.sleep(SLEPT_S),
-    )
+    recorder = Recorder(problem, "here")
+    seen = []
+
+    def watch(record, now):
+        return (
+            recorder(record, now),
+            seen.append(record.time_s),
+            time.sleep(SLEPT_S),
+        )
+
     options = jaxba.SolveOptions(max_iterations=6)
     return recorder.recording, jaxba.solve(problem, "ceres", options, watch=watch), seen
 

@@ -55,11 +55,9 @@ def fetch(
     the part that was received stays beside it under a hidden name, and the next call resumes it. A
     file without a checksum must decompress, and its header must have the counts of its name. Raises
     DownloadError: the download failed; one line."""
-    url, target, partial = (
-        f"{base_url.rstrip('/')}/{entry.file}",
-        folder / entry.file,
-        partial_path(entry, folder),
-    )
+    url = f"{base_url.rstrip('/')}/{entry.file}"
+    target = folder / entry.file
+    partial = partial_path(entry, folder)
     checksum = entry.sha256 if use_checksum else None
     try:
         if _is_there(target, checksum):
@@ -111,7 +109,8 @@ def _check(partial: Path, entry: Entry) -> None:
     try:
         header = read_bytes(partial)[:100].split(b"\n", 1)[0].split()
     except ProblemError as error:
-        header, why = [], reason(error.__cause__) if error.__cause__ else "it is no bz2 file"
+        header = []
+        why = reason(error.__cause__) if error.__cause__ else "it is no bz2 file"
     if header[:2] != [b"%d" % entry.cameras, b"%d" % entry.points]:
         partial.unlink()
         raise DownloadError(f"{entry.name}: what came is not the problem and was removed: {why}")

@@ -30,8 +30,12 @@ class _Bytes:
 
     def __init__(self, data: bytes, name: str, record: str):
         """`record` is what the file holds, such as "camera"."""
-        self.data, self.name, self.at = data, name, 0
-        self.record, self.about, self._named = record, "", False
+        self.data = data
+        self.name = name
+        self.at = 0
+        self.record = record
+        self.about = ""
+        self._named = False
 
     @property
     def left(self) -> int:
@@ -49,9 +53,11 @@ class _Bytes:
     def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
         values = self.unpack(fields.struct, self.about)
         if not self._named:
-            self.about, self._named = f"{self.record} {values[0]}", True
+            self.about = f"{self.record} {values[0]}"
+            self._named = True
         if fields.kinds is not None:
-            number, (known, _, unknown) = values[fields.codes.index("i")], fields.kinds
+            number = values[fields.codes.index("i")]
+            (known, _, unknown) = fields.kinds
             if number not in known.values():
                 self.fail(f"{self.about}{unknown.format(number)}")
         return values
@@ -68,7 +74,8 @@ class _Bytes:
         end = self.data.find(b"\0", self.at)
         if end < 0:
             self.fail(f"is cut short in the name of {self.about}")
-        value, self.at = self.data[self.at : end], end + 1
+        value = self.data[self.at : end]
+        self.at = end + 1
         return value
 
     def array(self, dtype: np.dtype, where: str) -> np.ndarray:
@@ -87,7 +94,8 @@ class _Bytes:
         one the file ends."""
         count = self.begin(smallest)
         for number in range(count):
-            self.about, self._named = f"{self.record} {number + 1} of {count}", False
+            self.about = f"{self.record} {number + 1} of {count}"
+            self._named = False
             yield self.about
         self.end(count)
 
@@ -114,10 +122,12 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray,
     file's name without its ending; `name` is for messages. Raises ProblemError: the file is cut
     short or too long, or a record cannot be understood; one line that names the file and the
     record."""
-    file, found = _Bytes(read_bytes(path, decompress=False), name, part.removesuffix("3D")[:-1]), {}
+    file = _Bytes(read_bytes(path, decompress=False), name, part.removesuffix("3D")[:-1])
+    found = {}
     if part == "points3D":
         return _read_points(file)
-    first, read_one = fields.FIRST[part], fields.READERS.get(part, _read_image)
+    first = fields.FIRST[part]
+    read_one = fields.READERS.get(part, _read_image)
     for _ in file.records(first.struct.size + (1 + _COUNT.size if first is fields.IMAGE else 0)):
         record = read_one(file)
         if record.id in found:
@@ -127,8 +137,12 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray,
 
 
 def _read_points(file: _Bytes) -> tuple[np.ndarray, np.ndarray]:
-    data, count, length_of = file.data, file.begin(POINT.itemsize), _COUNT.unpack_from
-    lengths, end, first = np.empty(count, np.int64), file.at, file.at
+    data = file.data
+    count = file.begin(POINT.itemsize)
+    length_of = _COUNT.unpack_from
+    lengths = np.empty(count, np.int64)
+    end = file.at
+    first = file.at
     for number in range(count):  # a track's length says where the next point is
         start = end
         if start + POINT.itemsize > len(data):
@@ -140,7 +154,8 @@ def _read_points(file: _Bytes) -> tuple[np.ndarray, np.ndarray]:
         lengths[number] = length
     file.at = end
     file.end(count)
-    points, tracks = np.empty(count, POINT), np.empty(lengths.sum(), TRACK)
+    points = np.empty(count, POINT)
+    tracks = np.empty(lengths.sum(), TRACK)
     for rows, elements, is_head in _blocks(lengths):
         codes = np.frombuffer(data, np.uint8, len(is_head), first)
         points[rows], tracks[elements] = codes[is_head].view(POINT), codes[~is_head].view(TRACK)

@@ -31,7 +31,10 @@ class Fields:
     ):
         """Names are separated by commas; codes are those of `struct`, of which `i` is one of the
         `kinds`; `largest` is that of integers in text, where it is not their type's."""
-        self.names, self.codes, self.kinds, self.largest = names.split(", "), codes, kinds, largest
+        self.names = names.split(", ")
+        self.codes = codes
+        self.kinds = kinds
+        self.largest = largest
         self.struct = struct.Struct(f"<{codes}")
 
 

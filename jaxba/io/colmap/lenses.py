@@ -29,7 +29,8 @@ def lenses_of(
     names = ["BAL"] if bal else sorted({camera.model for camera in cameras})
     models = tuple(CAMERA_MODELS[name] for name in names)
     size = max(map(len, models))
-    numbers, free = np.zeros((len(cameras), size)), np.zeros((len(cameras), size), bool)
+    numbers = np.zeros((len(cameras), size))
+    free = np.zeros((len(cameras), size), bool)
     for at, camera in enumerate(cameras):
         model = CAMERA_MODELS[camera.model]
         moves = [

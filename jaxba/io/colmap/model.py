@@ -165,7 +165,8 @@ class Model:
     @property
     def records(self) -> dict[str, dict[int, Any]]:
         """Records of each file but that of the points, by their ids."""
-        rigs, frames = self.rigs or {}, self.frames or {}
+        rigs = self.rigs or {}
+        frames = self.frames or {}
         return {"cameras": self.cameras, "images": self.images, "rigs": rigs, "frames": frames}
 
     @cached_property
@@ -187,7 +188,8 @@ def check_model(model: Model) -> None:
     """Refuses a damaged structure. Raises ProblemError: an id stands for none or is there twice, an
     image names no camera or a frame no rig, a pose is not finite or has no rotation; one line that
     names the file and the record."""
-    rigs, frames = model.rigs or {}, model.frames or {}
+    rigs = model.rigs or {}
+    frames = model.frames or {}
     for part, records in model.records.items():
         if NO_ID in records:
             _fail(model, part, f"{NO_ID} is the id of no {part[:-1]}")

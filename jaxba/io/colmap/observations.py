@@ -62,7 +62,10 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
     views = np.stack([owner[key], key, point[key]])
     del owner, key, point  # large
     dangling = np.flatnonzero(~exists & (table.keys["point"] != NO_POINT))
-    name = lambda key: f"{table.key_name(key)}, point {table.keys['point'][key]}"
+
+    def name(key):
+        return f"{table.key_name(key)}, point {table.keys['point'][key]}"
+
     no_point = f"left out, of a point that {table.model.file('points3D')} does not have"
     return views, _track_notes(table, views) + counted(
         table.model.file("images"), dangling, "key-point", no_point, name
@@ -72,14 +75,16 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
 def _track_notes(table: Ordered, views: Views) -> list[str]:
     """Lines on points whose tracks are not those of their key-points; none if tracks were not
     read."""
-    heads, elements = table.model.points, table.model.tracks
+    heads = table.model.points
+    elements = table.model.tracks
     if elements is None:
         return []
     point = np.repeat(np.argsort(table.order).astype(np.int32), heads["length"].astype(np.int64))
     image, registered = _positions(
         np.array([image.id for image in table.images], np.uint32), elements["image"]
     )
-    first, index = table.first_key, elements["key"]
+    first = table.first_key
+    index = elements["key"]
     same = registered & (index < np.append(np.diff(first), 0).astype(index.dtype)[image])
     place = np.where(same, first[image] + index.astype(np.int32), 0)
     same[same] = table.keys["point"][place[same]] == table.points["id"][point[same]]

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 # transform from the world (of a sensor: its rig): quaternion wxyz of any norm, translation
 Pose = tuple[float, ...]
 # from the order of `jaxba.problem.geometry` to COLMAP's, and back
-_WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
+_WXYZ = [3, 0, 1, 2]
+_XYZW = [1, 2, 3, 0]
 _LARGEST_EXPONENT = 500  # squares of larger numbers overflow float64, whose exponents end at 1023
 _SAME = 1e-6  # poses that differ by less, relatively, are the same
 
@@ -59,7 +60,8 @@ def composed(outer: Pose | None, inner: Pose) -> Pose:
     """The transform `outer` after `inner`; exactly the inner one for None."""
     if outer is None:
         return inner
-    first, second = rotations([inner])[0], rotations([outer])[0]
+    first = rotations([inner])[0]
+    second = rotations([outer])[0]
     moved = second.apply(inner[4:]) + np.array(outer[4:])
     return *(second * first).as_quat()[_WXYZ].tolist(), *moved.tolist()
 

@@ -130,7 +130,10 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
         for one in rig.sensors
         if one.type != CAMERA_SENSOR
     ]
-    name = lambda pair: f"sensor {pair[0].id} of rig {pair[1].id}"
+
+    def name(pair):
+        return f"sensor {pair[0].id} of rig {pair[1].id}"
+
     notes += counted(model.file("images"), blind, "image", "left out, without observations")
     notes += counted(
         model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name
@@ -189,7 +192,8 @@ def _posed(model: Model, image: Image) -> Image:
 def registered(model: Model) -> tuple[list[Image], list[str]]:
     """Registered images by id, in poses of their frames; notes on others. Raises ProblemError as
     `place_in_rig`."""
-    images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
+    images = [model.images[identity] for identity in sorted(model.images)]
+    frames = model.frame_of
     if model.frames is None:
         return images, []
     away = [image for image in images if image.id not in frames]
@@ -237,7 +241,8 @@ def rigs_of(model: Model, images: list[Image]) -> Rigs | None:
 
 def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     """Views of finite pixels and points, and notes on the others."""
-    model, what = table.model, "left out, not finite"
+    model = table.model
+    what = "left out, not finite"
     finite = np.asarray(np.isfinite(table.points["xyz"]).all(axis=1))
     notes = counted(
         model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name

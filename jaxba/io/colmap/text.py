@@ -32,7 +32,9 @@ class _Line:
 
     def __init__(self, place: str, text: bytes, record: str):
         """`record` is what the line holds, such as "camera"."""
-        self.place, self.text, self.record = place, text, record
+        self.place = place
+        self.text = text
+        self.record = record
         self.rest = text.split()
         self.about = ""  # the record with its id
 
@@ -90,7 +92,8 @@ class _Line:
     def _value(self, name: str, code: str, of: Fields) -> Any:
         word = self._word(name)
         if code == "i" and of.kinds is not None:
-            kind, (known, unknown, _) = word.decode("latin-1"), of.kinds
+            kind = word.decode("latin-1")
+            (known, unknown, _) = of.kinds
             return known[kind] if kind in known else self.fail(f"{kind!a} {unknown}")
         (value,) = self.numbers([word], code, name, of.largest)
         self.about = self.about or f"{self.record} {value}"
@@ -132,7 +135,8 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray,
 
 
 def _read_points(lines: Iterator[_Line]) -> tuple[np.ndarray, np.ndarray]:
-    heads, tracks = [], []
+    heads = []
+    tracks = []
     for line in lines:
         identity, x, y, z, red, green, blue, error = line.take(fields.POINT)
         if len(line.rest) % 2:
@@ -151,7 +155,8 @@ def _images(lines: Iterator[_Line]) -> Iterator[tuple[_Line, Image]]:
         if not line.rest:
             continue
         identity, *pose, camera = line.take(fields.IMAGE)
-        name, line.rest = line.text.split(None, _NAME)[_NAME:], []
+        name = line.text.split(None, _NAME)[_NAME:]
+        line.rest = []
         image = Image(identity, tuple(pose), camera, b"".join(name), np.empty(0, KEY))
         below = next(lines, None)
         if below is not None:

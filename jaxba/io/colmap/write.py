@@ -195,11 +195,14 @@ def _without(model: Model, assembled: Assembled, gone: Bool[np.ndarray, " observ
     """The model without some of its observations, and without the points that then have too few."""
     if not gone.any():
         return model
-    problem, images, heads = assembled.problem, dict(model.images), model.points
+    problem = assembled.problem
+    images = dict(model.images)
+    heads = model.points
     ids = np.array([image.id for image in assembled.images])[problem.camera_index]
-    code = lambda image, key: (
-        np.asarray(image, np.uint64) << np.uint64(32) | np.asarray(key, np.uint64)
-    )
+
+    def code(image, key):
+        return np.asarray(image, np.uint64) << np.uint64(32) | np.asarray(key, np.uint64)
+
     point = np.repeat(np.arange(len(heads)), heads["length"].astype(np.int64))
     elements = model.tracks
     assert elements is not None
@@ -250,7 +253,10 @@ def _with_poses(model: Model, of_problem: list[Image], problem: BundleProblem) -
     follows from another."""
     cameras = np.asarray(problem.cameras, np.float64)[:, :6]
     same = (cameras == bal_poses([image.pose for image in of_problem])).all(axis=1)
-    images, frames, changed, known = dict(model.images), dict(model.frames or {}), set(), set()
+    images = dict(model.images)
+    frames = dict(model.frames or {})
+    changed = set()
+    known = set()
     for image, kept, pose in zip(of_problem, same, colmap_poses(cameras), strict=True):
         known.add(image.id)
         images[image.id] = replace(images[image.id], pose=image.pose if kept else pose)
@@ -348,7 +354,8 @@ def create_model(problem: BundleProblem, target: str) -> Model:
         at = f"f of {part_name(problem.labels, 'image', wrong[0])} is {cameras[wrong[0], 6]:g}"
         raise ProblemError(f"cannot write {target}: {at}, and COLMAP's focal lengths are positive")
     _, first, lens = np.unique(lenses.index, return_index=True, return_inverse=True)
-    by_image, by_point = grouped(camera_index, len(cameras)), grouped(point_index, valid.num_points)
+    by_image = grouped(camera_index, len(cameras))
+    by_point = grouped(point_index, valid.num_points)
     keys = np.empty(valid.num_observations, records.KEY)
     keys["xy"], keys["point"] = np.asarray(valid.observations)[by_image], point_index[by_image]
     keys["point"] += 1
@@ -401,7 +408,8 @@ def _camera(
 ) -> Camera:
     """The camera of a lens; of one of BAL the smallest model that has all that is not zero or
     constant."""
-    model, (x, y) = lenses.model_of(lens), half.tolist()
+    model = lenses.model_of(lens)
+    (x, y) = half.tolist()
     size = int(2 * x), int(2 * y)
     if not lenses.all_bal:
         if model.name not in records.MODELS:

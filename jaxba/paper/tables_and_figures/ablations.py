@@ -70,11 +70,15 @@ def _sized(runner: Runner) -> list[Line]:
 
 def _size_statements(runner: Runner) -> list[Statement]:
     others = [x for x in runner.config.agents.state_sizes if x in STATE_SIZES and x != PAPER_STATE]
-    numbers = lambda size: f"{STATE_SIZES[PAPER_STATE]:g} against {STATE_SIZES[size]:g}"
-    text, name = (
-        "Five errors are better than {} ({{}})",
-        lambda size: agents.with_state_size(size).name,
-    )
+
+    def numbers(size):
+        return f"{STATE_SIZES[PAPER_STATE]:g} against {STATE_SIZES[size]:g}"
+
+    text = "Five errors are better than {} ({{}})"
+
+    def name(size):
+        return agents.with_state_size(size).name
+
     best = name(PAPER_STATE)
     return [
         Statement(order_claim, text.format(size), numbers(size), best, name(size))

@@ -20,7 +20,8 @@ from jaxba.paper.runner import TEST, Method, Runner, method_named
 from jaxba.solver.record import Record
 
 # rules with which every table compares: the paper's baseline and Ceres'
-CLASSIC, CERES = "classic", "ceres"
+CLASSIC = "classic"
+CERES = "ceres"
 # stands for the synthetic scenes, which are played and not solved one by one
 SCENES = Problems("synthetic", ())
 _SECTIONS = (
@@ -143,7 +144,10 @@ class Part:
             "iterations to convergence / to f\\*(1+1e-3); ✗: not within 100",
             *(x.label for x in self.lines),
         ]
-        cell = lambda source, line: _cell(runner.row_on([source], line.method))
+
+        def cell(source, line):
+            return _cell(runner.row_on([source], line.method))
+
         return table(
             header,
             [[s.name, *(cell(s, line) for line in self.lines)] for s in self.problems.sources],
@@ -176,7 +180,8 @@ class Table:
 
     def section(self, runner: Runner) -> tuple[list[str], list[Claim]]:
         """Paragraphs of the report from the results so far, and the claims."""
-        body, claims = [TEXTS[self.name][2].format_map(self.values(runner))], []
+        body = [TEXTS[self.name][2].format_map(self.values(runner))]
+        claims = []
         for part in self.parts(runner):
             rows = part.rows(runner)
             claims += [*judge(part.statements, rows.get, part.problems.name), *part.more(runner)]
@@ -187,7 +192,10 @@ class Table:
 def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     """A Markdown table; the first column is aligned left, the others right."""
     marks = [":--", *["--:"] * (len(header) - 1)]
-    plain = lambda cell: re.sub(r"([|<>*])", r"\\\1", " ".join(cell.split()))
+
+    def plain(cell):
+        return re.sub(r"([|<>*])", r"\\\1", " ".join(cell.split()))
+
     lines = [header, marks, *([plain(cell) for cell in row] for row in body)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -214,7 +222,10 @@ def _comparison(lines: Sequence[Line], rows: Mapping[str, Row]) -> str:
     header = ["method", "paper", "ours", "seeds: range", "success", "to f\\*(1+1e-3)", "good ends"]
     header += ["of classic: paper", "ours", "of Ceres' rule", *(["paper s", "s"] if timed else [])]
     papers = next((line.paper for line in lines if line.method.name == CLASSIC), math.nan)
-    over = lambda row, base: row.iterations / rows[base].iterations if base in rows else math.nan
+
+    def over(row, base):
+        return row.iterations / rows[base].iterations if base in rows else math.nan
+
     body = []
     for line in lines:
         row = rows.get(line.method.name) or Row(

@@ -46,10 +46,14 @@ def small_scene(size: int, seed: int) -> Source:
 
 
 def _small(runner: Runner) -> list[Part]:
-    config, parts = runner.config, []
+    config = runner.config
+    parts = []
     for size in config.small:
         seeds = range(config.seed, config.seed + config.small_scenes)
-        paper = lambda iterations, size=size: iterations if size == PAPER_SIZE else float("nan")
+
+        def paper(iterations, size=size):
+            return iterations if size == PAPER_SIZE else float("nan")
+
         lines = [
             named("classic", CLASSIC, paper(5.0)),
             named("Ceres' rule", CERES),
@@ -76,7 +80,10 @@ def main_problem(runner: Runner) -> Problems:
         real_problems.find(family) for family in runner.config.real.bal if family.name == "Ladybug"
     ]
     whole = [source for found in families for source in found.sources if source.make is None]
-    cameras = lambda source: int(next(iter(re.findall(r"\d+", source.name)), "0"))
+
+    def cameras(source):
+        return int(next(iter(re.findall(r"\d+", source.name)), "0"))
+
     chosen = max(whole, key=cameras) if whole else sources([runner.config.figures.scene])[0]
     return Problems(chosen.name, (chosen,))
 
@@ -131,15 +138,14 @@ def speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> c
     if not both.any():
         return claims.Claim(text, "figure", "-", "not run")
     one, other = (geometric_mean(times.seconds[both], SHORTEST_TIME) for times in (ours, classic))
-    seconds, (reached, base) = one / other, (float(done.mean()) for done in success)
+    seconds = one / other
+    (reached, base) = (float(done.mean()) for done in success)
     detail = f"time {seconds:.2f} of classic's, {both.sum()} of {len(names)} problems"
     lower = reached < base if faster else base < reached
     status: claims.Status
     if lower and abs(reached - base) > claims.FRACTION_TOLERANCE:
-        status, detail = (
-            "not",
-            f"{detail}, reached on {100 * reached:.0f} % against {100 * base:.0f} %",
-        )
+        status = "not"
+        detail = f"{detail}, reached on {100 * reached:.0f} % against {100 * base:.0f} %"
     elif faster:
         status = (
             "reproduced" if seconds <= claims.PARTLY_RATIO else "partly" if seconds < 1 else "not"
@@ -153,11 +159,14 @@ def speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> c
 def _convergence(runner: Runner) -> list[Part]:
     config = runner.config.figures
     large = sources([config.large_scene])[0]
-    lines = lambda linear: [
-        *(named(f"{name}, {linear}", f"{name}/{linear}") for name in (CLASSIC, CERES)),
-        Line(f"ours: scale-free state and guard, {linear}", runner.agent(agents.BEST, linear)),
-        Line(f"its twin, {linear}", runner.agent(agents.BEST, linear, twin=True)),
-    ]
+
+    def lines(linear):
+        return [
+            *(named(f"{name}, {linear}", f"{name}/{linear}") for name in (CLASSIC, CERES)),
+            Line(f"ours: scale-free state and guard, {linear}", runner.agent(agents.BEST, linear)),
+            Line(f"its twin, {linear}", runner.agent(agents.BEST, linear, twin=True)),
+        ]
+
     implicit = lines("implicit")
     return [
         Part(main_problem(runner), [*lines("explicit"), *implicit], repeats=1),
@@ -165,7 +174,9 @@ def _convergence(runner: Runner) -> list[Part]:
     ]
 
 
-_figures = lambda runner: {"figures": runner.config.figures}
+def _figures(runner):
+    return {"figures": runner.config.figures}
+
 
 FIGURES = (
     Table("lambda", _chart),

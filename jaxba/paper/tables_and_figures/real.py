@@ -23,7 +23,8 @@ from jaxba.paper.tables_and_figures.common import (
 )
 
 # names of our agents, trained elsewhere
-TUNED, GUARDED = f"{OURS.name}{ELSEWHERE}", f"{BEST.name}{ELSEWHERE}"
+TUNED = f"{OURS.name}{ELSEWHERE}"
+GUARDED = f"{BEST.name}{ELSEWHERE}"
 # between DeepLM's mean squared errors with and without ours, at most. Source: the paper
 MSE_DIFFERENCE = 0.003
 
@@ -85,8 +86,12 @@ def _bal(runner: Runner) -> list[Part]:
         *with_twin("DeepLM's solver", runner.elsewhere, "deeplm", paper=5.0, paper_s=20.3),
         *ours(runner, 4.0, 62.04, elsewhere=True),
     ]
-    over = lambda test, text, paper, ours, base: Statement(test, f"BAL: {text}", paper, ours, base)
-    third, with_deeplm = "DeepLM + ours takes a third of DeepLM's iterations", f"deeplm+{GUARDED}"
+
+    def over(test, text, paper, ours, base):
+        return Statement(test, f"BAL: {text}", paper, ours, base)
+
+    third = "DeepLM + ours takes a third of DeepLM's iterations"
+    with_deeplm = f"deeplm+{GUARDED}"
     statements = [over(ratio_claim, third, 1 / 3, with_deeplm, "deeplm+ceres")]
     for agent, what in ((TUNED, "tuned"), (GUARDED, "guarded")):
         statements += [
@@ -113,7 +118,8 @@ def _same_error(runner: Runner) -> Iterable[claims.Claim]:
     """The claim on the mean squared error of an observation, pixels squared, twice the final cost
     over their number: by how much it is larger with the agent, on each problem, the mean over the
     training runs."""
-    method, base = runner.elsewhere(BEST, "deeplm"), method_named("deeplm+ceres")
+    method = runner.elsewhere(BEST, "deeplm")
+    base = method_named("deeplm+ceres")
     excess = []
     for source in real_problems.bal(runner.config.real).sources:
         before = runner.records_on([source], [base])
