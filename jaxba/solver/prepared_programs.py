@@ -25,9 +25,8 @@ from jaxba.solver.prepare import DEFAULT_POLICY, set_up
 from jaxba.solver.stepwise import Stepwise
 
 SIZES = (
-    *((8, slots) for slots in (2048, 3072, 4096, 6144, 8192)),
-    *((16, slots) for slots in (8192, 12288, 16384, 20480)),
-    *((32, slots) for slots in (16384, 20480, 24576, 28672, 32768)),
+    *((8, slots) for slots in (1024, 2048, 4096, 8192)),
+    *((32, slots) for slots in (8192, 16384, 20480, 24576, 28672, 32768)),
     *((48, slots) for slots in (32768, 40960)),
     *((64, slots) for slots in (40960, 49152)),
 )
@@ -37,7 +36,7 @@ camera."""
 # cameras up to which a mapper adjusts all of them by its loss for local adjustments
 FEWEST = SIZES[0][0]
 
-LOCAL_SIZES = tuple((cameras, slots) for cameras in (8, 16, 32) for slots in (6144, 8192, 12288))
+LOCAL_SIZES = tuple((cameras, slots) for cameras in (8, 32, 48) for slots in (8192, 16384))
 """Those of the local adjustments of COLMAP's mapper: six free images, and all others that see their
 points."""
 

@@ -7,13 +7,13 @@ takes seconds where the solve may take a fraction of one. With padding all shape
 blocks (`sum_trees.prefix_levels`). Which cameras share a lens and what is constant is data. Padding
 contains no observations: it adds exact zeros to sums, and its cameras and points never change.
 
-A tenth to a third of the slots are padding: from rounding, and in half-filled chunks. The grid is
-coarse for small
-problems, where a program costs more than its padding: of the adjustments of a COLMAP mapper, which
-take three iterations each, 95 on 36 images of KITTI need 30 programs, and 54 with eight numbers of
-slots an octave. Larger problems are not padded (`capacity_of`), since their iterations take as long
-as compiling does. A problem with few points may lose more than others: with padding it may have too
-many of them for Woodbury's identity (structure/density.py)."""
+A tenth to a half of the slots are padding: from rounding, and in half-filled chunks. The grid is
+coarse for small problems, where reading a program from disk takes as long as twenty iterations: of
+the adjustments of a COLMAP mapper, which take three iterations each, 95 on 36 images of KITTI need
+19 kinds of programs; 28 with two numbers of slots an octave, 54 with eight. An iteration takes 1.0
+to 1.6 times as long as with the exact shape. Larger problems are not padded (`capacity_of`), since
+their iterations take as long as compiling does. A problem with few points may lose more than
+others: with padding it may have too many of them for Woodbury's identity (structure/density.py)."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from jaxba.problem.hold import every_lens
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
-CAMERAS = (8, 16, 32, 48, 64, 96, 128)  # longer sequences are better factored as bands
+CAMERAS = (8, 32, 48, 64, 96, 128)  # longer sequences are better factored as bands
 # of shared lenses; each takes as many products with the system as it has free numbers
 LENSES = (0, 1, 4, 16, 64)
 # slots per chunk. On five real problems 6 to 14% of such slots are empty; with three 11 to 28%
 POINT_CHUNK = 2
 # smallest number of slots. On Ladybug-49 a step takes 0.2 us per slot: these cost no time
 MIN_OBSERVATIONS = 1024
-# slots up to which two sizes an octave suffice, where a step takes 5 ms; then four
+# slots up to which powers of two suffice, where a step takes 5 ms; then four sizes an octave
 COARSE_OBSERVATIONS = 1 << 14
 # of the capacity, as few as suffice. Real problems have 0.2 to 0.6
-POINTS_PER_CHUNK = (1 / 2, 3 / 4, 1)
+POINTS_PER_CHUNK = (1 / 2, 1)
 # or 2, 4, ... times as many. Windows of kitti00vo have 2.9 to 4.2; spare pairs cost little
 PAIRS_PER_SLOT = 6
 MAX_CAMERAS = CAMERAS[-1]  # most cameras of a padded problem
@@ -81,12 +81,13 @@ def capacity_of(
 ) -> Capacity | None:
     """The capacity of a problem: its sizes rounded up to the grid.
 
-    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to two sizes an octave, or
-    four if there are many. Points and pairs get a fixed multiple of the slots, or the next larger
-    one if that is not enough: rounding each on its own would give more programs. `observations` are
-    the sorted ones of the problem, if they are known already. Returns None for problems with rigs
-    or other residuals than those of pixels, with more than `MAX_CAMERAS` or `MAX_PAIRS` or than the
-    last of `LENSES`, or with more observations or points than `MAX_OBSERVATIONS`."""
+    Cameras are rounded up to `CAMERAS`, shared lenses to `LENSES`, slots to powers of two, or to
+    four sizes an octave if there are many. Points and pairs get a fixed multiple of the slots, or
+    the next larger one if that is not enough: rounding each on its own would give more programs.
+    `observations` are the sorted ones of the problem, if they are known already. Returns None for
+    problems with rigs or other residuals than those of pixels, with more than `MAX_CAMERAS` or
+    `MAX_PAIRS` or than the last of `LENSES`, or with more observations or points than
+    `MAX_OBSERVATIONS`."""
     observations = observations or ObservationOrder.of(problem)
     cameras = observations.num_cameras
     points = len(observations.tracks)
@@ -148,7 +149,7 @@ def _rounded_slots(needed: int) -> int:
     """The number of slots of the grid at or above those that a problem needs."""
     power = _power(max(MIN_OBSERVATIONS, needed))
     # of sizes from half of the power up to it
-    step = power // 4 if power <= COARSE_OBSERVATIONS else power // 8
+    step = power if power <= COARSE_OBSERVATIONS else power // 8
     return max(MIN_OBSERVATIONS, -(-needed // step) * step)
 
 
