@@ -40,6 +40,9 @@ LOCAL_SIZES = tuple((cameras, slots) for cameras in (8, 32, 48) for slots in (81
 """Those of the local adjustments of COLMAP's mapper: six free images, and all others that see their
 points."""
 
+PAIR_SIZES = (1024, 2048)
+"""Slots of the first two images of COLMAP's mapper, which see all points alike."""
+
 # observations of a scene for each slot of its size; others are half of a chunk, or empty
 FILLED = 0.84
 TRACK = 4.3  # observations of a point, as in BAL's problems and in those of COLMAP on KITTI
@@ -122,6 +125,10 @@ def usual_kinds() -> Iterator[Kind]:
         yield Kind(_seen_twice(problem), Loss())
         if cameras == FEWEST:
             yield Kind(problem, MAPPER_LOSS)
+    for slots in PAIR_SIZES:
+        points = int(FILLED * slots / 2)
+        pair = random_scene(SceneConfig(2, points, 2 * points), 0)
+        yield Kind(_with_one_lens(pair), Loss())
     for cameras, slots in LOCAL_SIZES:
         local = _local(_with_one_lens(problem_of_size(cameras, slots)))
         yield Kind(local, MAPPER_LOSS)
