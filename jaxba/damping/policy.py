@@ -112,7 +112,7 @@ def check_policy(policy: object) -> None:
             f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)"
         )
     structure = jax.tree.structure(policy)
-    if jax.tree_util.treedef_is_leaf(structure):
+    if jax.tree_util.all_leaves([policy]):  # a policy may have no numbers
         raise ValueError(
             f"policy {name} is no pytree: decorate its dataclass with jaxba.register_pytree"
         )

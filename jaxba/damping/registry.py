@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from jaxba.damping.agent_config import embedded
 from jaxba.damping.default_policy import Guarded
 from jaxba.damping.learned import LearnedPolicy, always
 from jaxba.damping.policy import DampingPolicy, check_policy
+from jaxba.damping.policy_check import check_traceable
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import (
     Ceres,
@@ -96,7 +98,9 @@ def make_policy(name: str) -> DampingPolicy:
         )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}", "FILE.py:CLASS"])
-        raise InputError(f"unknown damping policy {name!r}; known: {known}")
+        similar = get_close_matches(base, [LEARNED, *POLICIES], 1)
+        meant = f", did you mean {similar[0]}?" if similar else ";"
+        raise InputError(f"unknown damping policy {name!r}{meant} known: {known}")
     policy = POLICIES[base][0]()
     if not colon:
         return policy
@@ -124,6 +128,7 @@ def _own(path: str, name: str) -> DampingPolicy:
         policy = getattr(module, name)() if hasattr(module, name) else None
         if policy is not None:
             check_policy(policy)
+            check_traceable(policy)
     except Exception as error:
         raise InputError(fault(error, path)) from None
     if policy is None:

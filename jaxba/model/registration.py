@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -29,11 +30,13 @@ from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residual, Residua
 from jaxba.problem.row_data import other_length
 from jaxba.runtime.compilation import program
 from jaxba.runtime.numerics import numerics
+from jaxba.runtime.trace_errors import advice
 from jaxba.structure.agreement import ALONE
 from jaxba.structure.residual_slots import ResidualSlots, laid_out, residual_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
 
 CHECKED_INDICES = "jax_check_static_indices"  # a setting of JAX
+LONGEST_REASON = 200  # characters of JAX's messages that are passed on
 
 
 def with_residual(
@@ -137,8 +140,8 @@ def _checked(problem: BundleProblem, residuals: Residuals) -> tuple[int, Residua
             traced, shape = _traced(kind, of, at)
         except Exception as error:
             _check_lengths(kind, of, at, math.inf)
-            text = " ".join(str(error).split())
-            raise ValueError(f"residual {name} cannot be computed: {shown(text, 200)}") from error
+            reason = textwrap.shorten(advice(error), LONGEST_REASON)
+            raise ValueError(f"residual {name} cannot be computed: {reason}") from error
         _check_lengths(kind, of, at, float(math.prod(shape[1:])))
         if len(shape) != 2 or not shape[1]:
             raise ValueError(

@@ -15,14 +15,24 @@ are."""
 from __future__ import annotations
 
 import functools
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import jax
+import numpy as np
+
+from jaxba.runtime.trace_errors import advice
 
 FOV_SMALL = 1e-4  # squared radius or squared omega below which FOV is a series, as in COLMAP
 
 # `r^2 / z^2` below which a fisheye projects as a pinhole: the difference is below rounding
 NEARLY_ON_AXIS = 1e-20
+
+# focal length with which a user's model is tried, pixels; everything else of its lens is zero
+EXAMPLE_FOCAL = 500.0
+LONGEST_REASON = 200  # characters of a message that is passed on
 
 Pixel = tuple[Any, Any]
 
@@ -83,12 +93,42 @@ def register_camera_model(name: str, parameters: str, project: Callable[..., Pix
     and `cy`; everything else counts as distortion. `project` goes from a sequence of these numbers,
     and x, y and z in the camera's frame (x right, y down, z forwards, scene units), to the two
     coordinates of a pixel. Written with operators and functions of `x.__array_namespace__()`, it
-    serves NumPy and JAX. Raises ValueError: another model has the name."""
+    serves NumPy and JAX. Raises ValueError: another model has the name, or `project` cannot be
+    computed, by NumPy or by JAX, or does not return two coordinates."""
     model = CameraModel(name, tuple(parameters.split()), project)
     if CAMERA_MODELS.get(name, model) != model:
         raise ValueError(f"there is a camera model {name} already")
+    if project.__module__ != __name__:
+        _check_projection(model)
     CAMERA_MODELS[name] = model
     return model
+
+
+def _check_projection(model: CameraModel) -> None:
+    """Raises a ValueError of one line unless NumPy and JAX can project two points."""
+    lens = [np.full(2, EXAMPLE_FOCAL if k in model.focal else 0.0) for k in range(len(model))]
+    point = (np.array([0.1, -0.2]), np.array([0.2, 0.1]), np.array([1.0, 2.0]))
+
+    def by_numpy() -> Any:
+        return model.project(lens, *point)
+
+    def by_jax() -> Any:
+        return jax.eval_shape(model.project, lens, *point)
+
+    for library, project in (("NumPy", by_numpy), ("JAX", by_jax)):
+        try:
+            pixel = project()
+        except Exception as error:
+            reason = textwrap.shorten(advice(error), LONGEST_REASON)
+            raise ValueError(
+                f"camera model {model.name} cannot be computed by {library}: {reason}"
+            ) from error
+        shapes = [getattr(coordinate, "shape", ()) for coordinate in pixel]
+        if shapes != [(2,), (2,)]:
+            raise ValueError(
+                f"camera model {model.name} must return two coordinates of the shape of x, "
+                f"not {len(shapes)} of shapes {shapes}"
+            )
 
 
 def _bal(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
+from typing import Any, Literal
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import trained_step
@@ -47,6 +49,37 @@ _GROUPS = {
     "tolerances": Tolerances,
 }
 """Options that are a group of options."""
+
+
+def refuse_keywords(function: str, keywords: Mapping[str, object]) -> None:
+    """Raises a TypeError that says where options belong, if a function was given some as keywords.
+
+    Args:
+        function: name of the function.
+        keywords: its keyword arguments that it does not have, by name."""
+    if not keywords:
+        return
+    name = next(iter(keywords))
+    in_groups = {
+        option: f"{group}=jaxba.{kind.__name__}({option}=...)"
+        for group, kind in _GROUPS.items()
+        for option in _names_of(kind)
+    }
+    known = in_groups | {option.name: f"{option.name}=..." for option in fields(SolveOptions)}
+    if name in known:
+        raise TypeError(
+            f"{function}() takes {name} in its options: options=jaxba.SolveOptions({known[name]})"
+        )
+    similar = get_close_matches(name, known, 1)
+    meant = f"; did you mean options=jaxba.SolveOptions({known[similar[0]]})?" if similar else ""
+    raise TypeError(f"{function}() has no argument {name}{meant}")
+
+
+def _names_of(group: type[Any]) -> tuple[str, ...]:
+    """Names of the options of a group, a dataclass or a named tuple."""
+    if is_dataclass(group):
+        return tuple(part.name for part in fields(group))
+    return group._fields
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import check_policy
+from jaxba.damping.policy_check import check_traceable
 from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState
 from jaxba.lm.step import state_of
@@ -157,6 +158,7 @@ def set_up(
     if isinstance(policy, str):
         policy, options = resolve_policy(policy, options)
     check_policy(policy)
+    check_traceable(policy)
     step = options.step_options(policy)
     away = set_aside(problem) if away is None else away
     devices = distributed.use_devices(options.devices)

@@ -28,7 +28,7 @@ from jaxba.runtime.numerics import numerics
 from jaxba.solver.checkpoint import Checkpoint, Saved
 from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.drivers import Callback, Compiled, IterationRecord, OnDevices, Watch
-from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.options import SolveOptions, checked_options, refuse_keywords
 from jaxba.solver.place import check_problem
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.solver.progress import SILENT, Waiting, shown
@@ -212,6 +212,7 @@ def solve(
     watch: Watch | None = None,
     verbose: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
+    **unknown: object,
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
@@ -252,7 +253,9 @@ def solve(
             the machine has, or the method does not support what the problem has (shared lenses,
             priors, rigs), or the checkpoint is that of another solve.
         RuntimeError: this process was forked from one in which JAX had started.
-        TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`."""
+        TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`, or with an option as an
+            argument of its own."""
+    refuse_keywords("solve", unknown)
     for name, function in (("callback", callback), ("watch", watch)):
         if function and not callable(function):
             raise ValueError(f"{name} must be a function")

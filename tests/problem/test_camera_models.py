@@ -185,3 +185,17 @@ def test_lenses_with_impossible_models_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             BundleProblem.create(*parts, lenses=lenses)
+
+
+@pytest.mark.parametrize(
+    ("project", "message"),
+    [
+        (lambda lens, x, y, z: (lens[0] * np.exp(np.asarray(x)), y), "by JAX: it calls NumPy"),
+        (lambda lens, x, y, z: (x, y) if x > 0 else (y, x), "by NumPy: "),
+        (lambda lens, x, y, z: (x, y, z), "two coordinates"),
+    ],
+)
+def test_a_wrong_camera_model_is_refused_when_registered(project, message):
+    with pytest.raises(ValueError, match=message):
+        register_camera_model("WRONG", "f", project)
+    assert "WRONG" not in CAMERA_MODELS

@@ -223,3 +223,18 @@ def test_options_are_hashable_so_that_they_can_be_keys():
         )
         == 3
     )
+
+
+@pytest.mark.parametrize(
+    ("keywords", "advice"),
+    [
+        ({"max_iterations": 5}, r"options=jaxba.SolveOptions\(max_iterations=...\)"),
+        ({"ftol": 1e-3}, r"SolveOptions\(tolerances=jaxba.Tolerances\(ftol=...\)\)"),
+        ({"max_iteration": 5}, r"did you mean options=jaxba.SolveOptions\(max_iterations=...\)\?"),
+        ({"callbak": print}, "no argument callbak$"),
+    ],
+)
+def test_an_option_given_as_an_argument_is_named_with_its_place(keywords, advice):
+    problem = jaxba.random_scene(jaxba.SceneConfig(4, 30, 100), 0)
+    with pytest.raises(TypeError, match=advice):
+        jaxba.solve(problem, **keywords)
