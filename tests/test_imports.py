@@ -44,7 +44,7 @@ ORDER = (
         "viewer",
         "jaxba",
     ),
-    *("methods", "kitti", "game", "training", "peers", "bench", "paper", "cli"),
+    *("methods", "kitti", "game", "training", "peers", "bench", "paper", "cli", "__main__"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and
 all before it."""

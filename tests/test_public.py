@@ -82,7 +82,7 @@ def test_no_public_function_hides_a_module():
     assert not {name for name in modules if inspect.isfunction(getattr(jaxba, name, None))}
     # where no room has the name of a function, and every other module stands in a room, there is
     # none to hide
-    alone = {"__init__.py", "rotations.py", "typing.py", "py.typed"}
+    alone = {"__init__.py", "__main__.py", "rotations.py", "typing.py", "py.typed"}
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == alone
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxba.cli.options import BAD_INPUT, Arguments, parse
+from jaxba.cli.short_help import HELP_ALL
 from jaxba.cli.streams import UnwritableStreamError, tolerant_streams
 from jaxba.runtime.interrupt import ENDED, INTERRUPTED, Interrupt
 from jaxba.typing import InputError
@@ -44,6 +45,7 @@ def run_command(
     description: str,
     argv: Sequence[str] | None,
     subcommand: str = "",
+    short_page: str = "",
 ) -> int:
     """Parses the command line and runs `main`. Expected errors, and signals that `main` does not
     handle, are one line on stderr. Returns the exit status: that of `main`, 2 after an error, 130
@@ -55,11 +57,21 @@ def run_command(
         main: gets the parsed arguments and returns the exit status.
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
-        subcommand: for the help, if `argv` is without it."""
+        subcommand: for the help, if `argv` is without it.
+        short_page: what `--help` prints, if `--help-all` prints all options."""
+    words = list(sys.argv[1:] if argv is None else argv)
     with Interrupt() as interrupt, tolerant_streams():
         try:
+            if words == ["--version"]:
+                print_line(_versions())
+                return 0
+            if short_page and {"-h", "--help"} & set(words):
+                print_line(short_page)
+                return 0
+            if short_page:
+                words = ["--help" if word == HELP_ALL else word for word in words]
             program = f"jaxba-{arguments.__module__.rpartition('.')[2]} {subcommand}".strip()
-            status = _run(main, parse(arguments, description, program, argv))
+            status = _run(main, parse(arguments, description, program, words))
             print(end="", flush=True)
             return interrupt.status or status if status == INTERRUPTED else status
         except (KeyboardInterrupt, Exception) as error:
@@ -71,6 +83,13 @@ def run_command(
             if isinstance(error, UnwritableStreamError):
                 return print_error(str(error))
             raise
+
+
+def _versions() -> str:
+    from importlib.metadata import version
+
+    python = ".".join(map(str, sys.version_info[:3]))
+    return f"jaxba {version('jaxba')}, JAX {version('jax')}, Python {python}"
 
 
 def command_line(name: str, argv: Sequence[str] | None) -> str:

@@ -40,8 +40,9 @@ def options(cls: type[Arguments]) -> type[Arguments]:
     """Makes a frozen dataclass of options, or gives one its help.
 
     The text below a field is its help, whatever the lengths of its lines. A text in the annotation,
-    `Annotated[str, "FILE"]`, stands for the value in the help. A class that inherits from several
-    such classes has their options, in the help a group for each class."""
+    `Annotated[str, "FILE"]`, stands for the value in the help; one like "-o" is a short name. A
+    class that inherits from several such classes has their options, in the help a group for each
+    class."""
     texts = _texts(cls)
     hints = get_type_hints(cls, include_extras=True)
     for name in cls.__annotations__:
@@ -49,9 +50,13 @@ def options(cls: type[Arguments]) -> type[Arguments]:
         kind, *extras = (
             get_args(hints[name]) if get_origin(hints[name]) is Annotated else [hints[name]]
         )
+        words = [extra for extra in extras if isinstance(extra, str)]
+        short_names = [word for word in words if word.startswith("-")]
+        metavars = [word for word in words if not word.startswith("-")]
         shown = tyro.conf.arg(
             help=texts.get(name),
-            metavar=next((extra for extra in extras if isinstance(extra, str)), _metavar(kind)),
+            aliases=short_names or None,
+            metavar=metavars[0] if metavars else _metavar(kind),
             help_behavior_hint="" if default is None or default is False or default == () else None,
             prefix_name=False,
         )

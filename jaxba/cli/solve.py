@@ -20,6 +20,7 @@ from jaxba.cli.constraints import surveyed
 from jaxba.cli.options import options
 from jaxba.cli.output import check_outputs, check_storable, fitting, write_solution
 from jaxba.cli.overwriting import policy_file
+from jaxba.cli.short_help import short_help
 from jaxba.cli.streams import whole_input
 from jaxba.constraints.file import Survey
 from jaxba.constraints.report import report
@@ -205,7 +206,7 @@ class Stop:
 class Output:
     """What is written and shown."""
 
-    output: Annotated[str | None, "FILE"] = None
+    output: Annotated[str | None, "FILE", "-o"] = None
     """Solution in BAL format, compressed by its ending; .out: Bundler's; .ply: for a viewer; .json:
     cameras for nerfstudio; -: standard output. An existing folder or NAME/ becomes a COLMAP model;
     so does any name if the problem is one, but for these endings, .txt, .bal, .bz2, .gz and .xz. Of
@@ -246,6 +247,30 @@ class Arguments(Problem, Step, Stop, Output, Devices):
     """Options of `jaxba-solve`."""
 
 
+EVERYDAY = (
+    "output",
+    "constant",
+    "gauge",
+    "constraints",
+    "loss",
+    "loss_scale",
+    "reject",
+    "strict",
+    "policy",
+    "max_iterations",
+    "seconds",
+    "view",
+)
+"""Options that `--help` shows; `--help-all` shows all."""
+
+EXAMPLES = (
+    ("jaxba-solve sparse/0 -o refined/", "Refine a COLMAP model, and write another one."),
+    ("jaxba-solve problem.txt.bz2 --view", "Solve a BAL problem, and watch it in the browser."),
+    ("jaxba-solve sparse/0 -o out/ --constraints site.yaml", "With GPS, control points, or gauge."),
+)
+"""Command lines that `--help` shows, with what they do."""
+
+
 def main() -> None:
     """Entry point of `jaxba-solve`."""
     common.exit_with(run())
@@ -258,9 +283,9 @@ def run(argv: Sequence[str] | None = None) -> int:
         words = translated(sys.argv[1:] if argv is None else argv)
     except common.UsageError as error:
         return common.print_error(str(error))
-    return common.run_command(
-        Arguments, _run, "Bundle adjustment of a problem, or of several.", words
-    )
+    text = "Bundle adjustment of a problem, or of several."
+    page = short_help(Arguments, "jaxba-solve", text, EVERYDAY, EXAMPLES)
+    return common.run_command(Arguments, _run, text, words, short_page=page)
 
 
 def solver_name(args: Arguments) -> SolverName:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import sys
 from itertools import pairwise
 
 import pytest
 
+import jaxba.__main__
+
 LINES = {
-    "solve": 143,
+    "solve": 60,
     "bench": 44,
     "data": 20,
     "data download": 26,
@@ -28,16 +32,43 @@ def test_help_is_short_and_names_the_command(command, capsys, monkeypatch):
     module, *subcommand = command.split()
     assert importlib.import_module(f"jaxba.cli.{module}").run([*subcommand, "--help"]) == 0
     usage, *lines = capsys.readouterr().out.splitlines()
-    assert usage.startswith(f"usage: jaxba-{command} [-h] ")
+    assert usage.startswith(f"usage: jaxba-{command} [")
     assert len(lines) < LINES[command]
     assert max(map(len, lines)) <= 80
     assert not [line for line in lines if "None" in line]
 
 
+def test_all_options_of_solve_fit_144_lines(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert importlib.import_module("jaxba.cli.solve").run(["--help-all"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert 100 < len(lines) <= 144
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("command", ["solve", "bench", "train", "view", "kitti"])
+def test_commands_print_versions(command, capsys):
+    assert importlib.import_module(f"jaxba.cli.{command}").run(["--version"]) == 0
+    versions = dict(part.split() for part in capsys.readouterr().out.strip().split(", "))
+    assert versions["JAX"] == importlib.metadata.version("jax")
+
+
+def test_commands_run_as_a_module(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["jaxba", "solve", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        jaxba.__main__.main()
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("jaxba ")
+    monkeypatch.setattr(sys, "argv", ["jaxba", "sovle"])
+    with pytest.raises(SystemExit) as ended:
+        jaxba.__main__.main()
+    assert ended.value.code == 2
+
+
 def test_a_text_is_reflowed(capsys, monkeypatch):
     """Each line but the last of a text ends where the next word would not fit."""
     monkeypatch.setenv("COLUMNS", "80")
-    importlib.import_module("jaxba.cli.solve").run(["--help"])
+    importlib.import_module("jaxba.cli.solve").run(["--help-all"])
     lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
     first = next(k for k, line in enumerate(lines) if line.startswith("--policy"))
     text = lines[first + 1 : next(k for k, line in enumerate(lines) if line.startswith("--method"))]

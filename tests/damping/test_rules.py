@@ -307,7 +307,10 @@ def test_every_name_makes_its_policy_with_the_lambda_that_was_asked_for():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("cerse", "unknown damping policy 'cerse', did you mean ceres? known: learned, ceres, classic"),
+        (
+            "cerse",
+            "unknown damping policy 'cerse', did you mean ceres? known: ",
+        ),
         ("", "unknown damping policy ''"),
         ("ceres+embedded", "unknown damping policy 'ceres+embedded': its name has no '+'"),
         ("ceres:x", "must be a positive number, not 'x'"),
