@@ -1,5 +1,5 @@
-"""What there is to carry (lines, classes, rooms, branches, words), and how far a value walks
-through the code.
+"""What there is to carry (lines, statements, classes, rooms, branches, words), how plain it is, and
+how far a value walks through the code.
 
     python -m benchmarks.size [FOLDER]
 
@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxba
+from benchmarks.plainness import plainness
 
 LABORATORY = ("methods", "kitti", "datasets/kitti", "game", "training", "peers", "bench", "paper")
 """Rooms that ask rather than solve, as in tests/test_imports.py; earlier versions had KITTI among
@@ -98,7 +99,7 @@ def inner_imports(root: Path) -> int:
     return found
 
 
-def counts(root: Path) -> dict[str, int]:
+def counts(root: Path) -> dict[str, float]:
     """The table of what there is."""
     texts = sources(root)
     python = {path: text for path, text in texts.items() if path.endswith(".py")}
@@ -125,6 +126,7 @@ def counts(root: Path) -> dict[str, int]:
             for path, text in python.items()
             if room(path) in CORE
         ),
+        **plainness(python.values()),
         "words of documents": sum(len(path.read_text().split()) for path in documents),
         "inner imports in tests": inner_imports(root),
     }
@@ -196,9 +198,9 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     root = Path(sys.argv[1]) if len(sys.argv) > 1 else Path.cwd()
     for name, value in counts(root).items():
-        print(f"{name:32} {value:8,}")
+        print(f"{name:42} {value:8,}")
     for name, walk in walks().items() if root == Path.cwd() else ():
-        print(f"{name:32} {walk}")
+        print(f"{name:42} {walk}")
 
 
 if __name__ == "__main__":
