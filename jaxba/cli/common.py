@@ -189,9 +189,11 @@ def prepare_process(*, untraced: bool = False) -> None:
     compiled in parallel, which are found without tracing them (`keep_programs`), otherwise all of
     them, by JAX's own cache."""
     from jaxba.runtime import process
+    from jaxba.runtime.announce import announce_nothing
     from jaxba.runtime.program_cache import keep_programs, keep_programs_by_jax
 
     process.keep_memory()
+    announce_nothing()
     if untraced:
         keep_programs()
     else:

@@ -28,6 +28,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.preprocess import far_middle, middle_and_extent, shift
 from jaxba.problem.residuals import LENS, POINT, POSE, SECOND, Residual, Residuals, Rows, with_rows
 from jaxba.problem.row_data import other_length
+from jaxba.runtime.announce import announced
 from jaxba.runtime.compilation import program
 from jaxba.runtime.numerics import numerics
 from jaxba.runtime.trace_errors import advice
@@ -77,7 +78,8 @@ def with_residual(
     rows = replace(rows, loss=loss or Loss(), size=1)
     found = with_rows(problem.residuals, rows, dict(unknowns or {}), counts)
     _check_values(problem.labels, found.rows[-1])
-    size, known = _checked(problem, found)
+    with announced(f"registering residual {rows.residual.name}, whose derivatives are compiled"):
+        size, known = _checked(problem, found)
     rows = replace(found.rows[-1], size=size, residual=known, whole=())
     return problem.replace(residuals=replace(found, rows=(*found.rows[:-1], rows)))
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 
+from jaxba.runtime.announce import announced
 from jaxba.solver.drivers import Callback, IterationRecord
 
 COLUMNS = (
@@ -38,6 +39,14 @@ class Waiting:
 
 
 SILENT = Waiting()
+
+
+class Announced(Waiting):
+    """A line of the logger `jaxba` if programs compile for long (runtime/announce.py)."""
+
+    def compiling(self) -> AbstractContextManager:
+        """See `Waiting`."""
+        return announced("compiling programs for a problem of this kind and size")
 
 
 class Printed(Waiting):
@@ -84,7 +93,7 @@ def shown(callback: Callback | None, verbose: bool) -> tuple[Callback | None, Wa
     """A callback that prints a row and calls the one that is given, and what is printed of things
     that take time."""
     if not verbose:
-        return callback, SILENT
+        return callback, Announced()
     printed = Printed()
     begun = False
 
