@@ -233,9 +233,11 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
         frame = np.asarray(problem.rigs.frame)
         alone = alone & ~np.isin(frame, frame[cameras])
     before, after = (views_behind(p) for p in (problem, solution.problem))
+    dropped = solution.rejected is not None and bool(solution.rejected.any())
+    fate = "left out of the output" if dropped else "positions stay as they are"
     found = [
         (int(np.sum(alone)), "camera", "without observations; poses stay as they are"),
-        (int(np.sum(points == 0)), "point", "without observations; positions stay as they are"),
+        (int(np.sum(points == 0)), "point", f"without observations; {fate}"),
         (int(np.sum(points == 1)), "point", "seen once; damping alone fixes the depth"),
     ]
     lines = [f"note: {counted(count, noun)} {text}" for count, noun, text in found if count]

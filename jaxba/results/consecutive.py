@@ -49,6 +49,10 @@ class Consecutive:
         """All solves together."""
         return functools.reduce(joined, self.done)
 
+    def begin_phase(self, text: str) -> None:
+        """Shows what the next solve is of."""
+        self._waiting.begin_phase(text)
+
     def solve(
         self,
         away: Int[np.ndarray, " away"],

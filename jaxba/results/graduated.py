@@ -127,6 +127,7 @@ def solve_graduated(
     start = Consecutive(policy, None, None, waiting, limit).solve(
         NO_CAMERAS, problem.subset(kept), none, problem
     )
+    solves.begin_phase(f"the {np.count_nonzero(kept)} observations that fit")
     last = solves.solve(NO_CAMERAS, found.subset(kept), none if solves.stopped else options, found)
     limit.warn_if_too_short(solves.total.termination, solves.total.iterations)
     return replace(
@@ -158,6 +159,7 @@ def _descend(
     for _ in range(STAGES if limit and not solves.stopped else 0):
         root = np.maximum(1 / (1 + (_distances(problem, good) / scale) ** 2), LEAST_WEIGHT)
         own = np.eye(2) if problem.whitening is None else np.asarray(problem.whitening)
+        solves.begin_phase(f"all observations, with weights for residuals around {scale:.3g} px")
         found = solves.solve(
             away, problem.replace(whitening=root[:, None, None] * own), options, problem
         )

@@ -29,6 +29,9 @@ class Waiting:
     def resume(self, iterations: int, time_s: float) -> None:
         """Before a solve goes on after so many iterations and seconds."""
 
+    def begin_phase(self, text: str) -> None:
+        """Before one of several solves: what it solves."""
+
     def compiling(self) -> AbstractContextManager:
         """The context in which programs compile."""
         return nullcontext()
@@ -65,6 +68,10 @@ class Printed(Waiting):
         """See `Waiting`."""
         self.tell(f"goes on after {iterations} iterations")
         self.time_s = time_s
+
+    def begin_phase(self, text: str) -> None:
+        """See `Waiting`."""
+        self.tell(f"   -- {text}")
 
     def compiling(self) -> AbstractContextManager:
         """See `Waiting`."""

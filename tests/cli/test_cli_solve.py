@@ -696,10 +696,12 @@ def test_reject_notes_wrong_matches_by_image_and_leaves_them_out_of_the_model(tm
     write_problem(scene.replace(observations=pixels), f"{tmp_path}/model/")
     arguments = [str(tmp_path / "model"), "--reject", "--compilation", "quick", "--output"]
     assert run([*arguments, str(tmp_path / "out")]) == 0
-    notes = [
-        line for line in capsys.readouterr().out.splitlines() if line.startswith("note: rejected ")
-    ]
+    lines = capsys.readouterr().out.splitlines()
+    notes = [line for line in lines if line.startswith("note: rejected ")]
     left = read_problem(tmp_path / "out").num_observations
+    phases = [line for line in lines if line.startswith("   -- ")]
+    assert phases[0].startswith("   -- all observations, with weights for residuals around ")
+    assert phases[-1] == f"   -- the {left} observations that fit"
     assert len(notes) == 1
     assert re.match(
         rf"note: rejected {len(wrong) - left} of {len(wrong)} observations: image \d+ \(", notes[0]
