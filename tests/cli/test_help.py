@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import subprocess
 import sys
 from itertools import pairwise
 
 import pytest
-
-import jaxba.__main__
 
 LINES = {
     "solve": 60,
@@ -53,16 +52,12 @@ def test_commands_print_versions(command, capsys):
     assert versions["JAX"] == importlib.metadata.version("jax")
 
 
-def test_commands_run_as_a_module(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["jaxba", "solve", "--version"])
-    with pytest.raises(SystemExit) as ended:
-        jaxba.__main__.main()
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith("jaxba ")
-    monkeypatch.setattr(sys, "argv", ["jaxba", "sovle"])
-    with pytest.raises(SystemExit) as ended:
-        jaxba.__main__.main()
-    assert ended.value.code == 2
+def test_commands_run_as_a_module():
+    python = [sys.executable, "-m", "jaxba"]
+    shown = subprocess.run([*python, "solve", "--version"], capture_output=True, text=True)
+    assert (shown.returncode, shown.stdout.split()[0]) == (0, "jaxba")
+    refused = subprocess.run([*python, "sovle"], capture_output=True, text=True)
+    assert (refused.returncode, refused.stdout.split()[0]) == (2, "usage:")
 
 
 def test_a_text_is_reflowed(capsys, monkeypatch):
