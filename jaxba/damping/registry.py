@@ -149,7 +149,8 @@ def _module(path: str, _changed: int) -> Any:
 
 def fault(error: Exception, path: str) -> str:
     """What went wrong in a file of Python, and where, in one line."""
-    frames = traceback.extract_tb(error.__traceback__)
+    # of an error that explains another one, the place is that of the other
+    frames = traceback.extract_tb((error.__cause__ or error).__traceback__)
     numbers = [frame.lineno for frame in frames if frame.filename == os.path.abspath(path)]
     where = f"{path}, line {numbers[-1]}" if numbers else path
     if isinstance(error, OSError) and not numbers:

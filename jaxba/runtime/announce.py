@@ -1,7 +1,8 @@
-"""Work that takes long is announced: by the logger `jaxba`, once it has taken two seconds.
+"""Work that takes long is announced: by the logger `jaxba.progress`, after two seconds.
 
-Without further settings Python shows that on stderr; `logging.getLogger("jaxba").setLevel("ERROR")`
-keeps it quiet. The commands, which show progress of their own, do so."""
+Without further settings Python shows that on stderr;
+`logging.getLogger("jaxba.progress").setLevel("ERROR")` keeps it quiet. The commands, which show
+progress of their own, do so."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from contextlib import contextmanager
 LONG_S = 2.0
 """Seconds of work that nobody wonders about."""
 
-LOGGER = logging.getLogger("jaxba")
+LOGGER = logging.getLogger("jaxba.progress")
 
 
 @contextmanager

@@ -45,7 +45,7 @@ SILENT = Waiting()
 
 
 class Announced(Waiting):
-    """A line of the logger `jaxba` if programs compile for long (runtime/announce.py)."""
+    """A line of the logger `jaxba.progress` if programs compile for long (runtime/announce.py)."""
 
     def compiling(self) -> AbstractContextManager:
         """See `Waiting`."""

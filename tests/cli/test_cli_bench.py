@@ -434,9 +434,13 @@ class Needy(Same):
 def test_a_rule_in_a_file_is_run_like_others_and_its_fault_is_one_line(tmp_path, undrawn, capsys):
     path = tmp_path / "my+rules@1.py"
     path.write_text(RULES)
-    names = [f"{path}:Same", f"{path}:Same+refine1", "constant:1e-4", f"{path}:Branching"]
-    status = bench(tmp_path / "run", "scene:tiny", "--solvers", ",".join(names), *BRIEF[2:])
-    check_one_line(status, capsys.readouterr().err, f"{path}, line 21: TracerBoolConversionError: ")
+    names = [f"{path}:Same", f"{path}:Same+refine1", "constant:1e-4"]
+    arguments = ["scene:tiny", *BRIEF[2:], "--solvers"]
+    status = bench(tmp_path / "refused", *arguments, f"{path}:Branching")
+    message = f"{path}, line 21: ValueError: policy Branching: propose cannot be compiled: "
+    check_one_line(status, capsys.readouterr().err, message)
+    assert bench(tmp_path / "run", *arguments, ",".join(names)) == 0
+    capsys.readouterr()
     own, refined, constant = lines(tmp_path / "run")
     assert [own["solver"], refined["solver"]] == names[:2]
     assert own["final_cost"] == pytest.approx(constant["final_cost"], rel=1e-9)

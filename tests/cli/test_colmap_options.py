@@ -320,7 +320,9 @@ def test_notes_of_a_solve_know_what_is_constant(unchecked):
 
     def remarks(problem: BundleProblem) -> str:
         return "".join(
-            table.remarks(problem, SimpleNamespace(problem=problem, set_aside=np.zeros(0, int)))
+            table.remarks(
+                problem, SimpleNamespace(problem=problem, set_aside=np.zeros(0, int), rejected=None)
+            )
         )
 
     problem = support.odd()
